@@ -1,0 +1,202 @@
+//! The wiring of a robot: which driver serves which camera, servo pair and radio (TOML).
+//!
+//! ```toml
+//! robot = "workcell.urdf"          # relative to this file
+//!
+//! [left]                           # and [right]
+//! pan_joint = "left_pan_joint"
+//! tilt_joint = "left_tilt_joint"
+//! optical_frame = "left_optical_frame"
+//! camera = { driver = "sim", width = 320, height = 240, fx = 300.0, fy = 300.0, cx = 159.5, cy = 119.5 }
+//! servos = { driver = "sim" }
+//!
+//! [radio]
+//! driver = "sim"
+//! ```
+//!
+//! Unknown keys are errors that name the key. What only one driver needs stands in that driver's own
+//! table and is read by it: `[sim]` for the simulated workcell.
+
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+use vergence_geometry::{Camera, CameraError, Distortion};
+
+use crate::traits::Side;
+
+/// Why a configuration was refused.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// The file could not be read.
+    #[error("cannot read {path}: {source}")]
+    Read {
+        /// Which file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// Not TOML, an unknown or a missing key; the text shows the line.
+    #[error("{path}: {message}")]
+    Parse {
+        /// Which file.
+        path: PathBuf,
+        /// The parser's message with line and key.
+        message: String,
+    },
+    /// The camera's numbers cannot be.
+    #[error("[{side}.camera]: {source}")]
+    Camera {
+        /// Which camera.
+        side: &'static str,
+        /// What is wrong.
+        source: CameraError,
+    },
+}
+
+/// A robot's wiring.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Config {
+    /// The URDF file, relative to the configuration's folder.
+    pub robot: PathBuf,
+    /// Left head.
+    pub left: HeadConfig,
+    /// Right head.
+    pub right: HeadConfig,
+    /// Tag radio.
+    pub radio: DriverConfig,
+    /// The simulated workcell's own table, read by the simulator.
+    #[serde(default)]
+    pub sim: Option<toml::Table>,
+}
+
+/// Wiring of one head.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct HeadConfig {
+    /// URDF joint of the pan axis.
+    pub pan_joint: String,
+    /// URDF joint of the tilt axis.
+    pub tilt_joint: String,
+    /// URDF link of the camera's optical frame.
+    pub optical_frame: String,
+    /// The camera.
+    pub camera: CameraConfig,
+    /// The servos.
+    pub servos: DriverConfig,
+}
+
+/// A camera's driver and its nominal lens.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CameraConfig {
+    /// Driver name.
+    pub driver: String,
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// Focal length (px).
+    pub fx: f64,
+    /// Focal length (px).
+    pub fy: f64,
+    /// Principal point (px).
+    pub cx: f64,
+    /// Principal point (px).
+    pub cy: f64,
+    /// Distortion k1, k2, p1, p2, k3.
+    #[serde(default)]
+    pub distortion: [f64; 5],
+}
+
+/// A device that needs no more than a driver's name.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DriverConfig {
+    /// Driver name.
+    pub driver: String,
+}
+
+impl Config {
+    /// Reads a configuration file.
+    pub fn read(path: &Path) -> Result<Self, ConfigError> {
+        let text = std::fs::read_to_string(path)
+            .map_err(|source| ConfigError::Read { path: path.into(), source })?;
+        Self::parse(&text, path)
+    }
+
+    /// Reads a configuration from text; `path` is for messages only.
+    pub fn parse(text: &str, path: &Path) -> Result<Self, ConfigError> {
+        let config: Config = toml::from_str(text).map_err(|error| ConfigError::Parse {
+            path: path.into(),
+            message: error.to_string(),
+        })?;
+        for side in Side::BOTH {
+            let camera = config.head(side).camera.model();
+            camera
+                .validate()
+                .map_err(|source| ConfigError::Camera { side: side.name(), source })?;
+        }
+        Ok(config)
+    }
+
+    /// The wiring of one head.
+    pub fn head(&self, side: Side) -> &HeadConfig {
+        match side {
+            Side::Left => &self.left,
+            Side::Right => &self.right,
+        }
+    }
+}
+
+impl CameraConfig {
+    /// The nominal camera model.
+    pub fn model(&self) -> Camera {
+        let [k1, k2, p1, p2, k3] = self.distortion;
+        Camera {
+            width: self.width,
+            height: self.height,
+            fx: self.fx,
+            fy: self.fy,
+            cx: self.cx,
+            cy: self.cy,
+            distortion: Distortion { k1, k2, p1, p2, k3 },
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const HEAD: &str = r#"
+        pan_joint = "p"
+        tilt_joint = "t"
+        optical_frame = "o"
+        camera = { driver = "sim", width = 320, height = 240, fx = 300.0, fy = 300.0, cx = 159.5, cy = 119.5 }
+        servos = { driver = "sim" }"#;
+
+    fn parse(extra: &str) -> Result<Config, ConfigError> {
+        let text = format!(
+            "robot = 'r.urdf'\n{extra}\n[left]\n{HEAD}\n[right]\n{HEAD}\n[radio]\ndriver = 'sim'\n"
+        );
+        Config::parse(&text, Path::new("robot.toml"))
+    }
+
+    #[test]
+    fn a_wrong_key_is_named_with_its_line() {
+        assert_eq!(parse("").unwrap().left.camera.model().fx, 300.0);
+        let message = parse("colour = 'red'").unwrap_err().to_string();
+        assert!(message.contains("colour") && message.contains("robot.toml"), "{message}");
+    }
+
+    #[test]
+    fn an_impossible_camera_is_named() {
+        let text = format!(
+            "robot = 'r'\n[left]\n{}\n[right]\n{HEAD}\n[radio]\ndriver = 'sim'\n",
+            HEAD.replace("fx = 300.0", "fx = -1.0")
+        );
+        let message = Config::parse(&text, Path::new("x")).unwrap_err().to_string();
+        assert!(message.starts_with("[left.camera]: camera fx"), "{message}");
+    }
+}

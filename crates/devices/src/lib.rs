@@ -1,0 +1,17 @@
+//! How the outside comes in: traits for cameras, pan-tilt heads and tag radios, their drivers, and
+//! the robot's description (URDF) and wiring (TOML).
+//!
+//! Everything above talks to [`Camera`], [`PanTilt`], [`TagLink`] and [`Clock`] only; whether a wire
+//! or the simulator answers is a line in the configuration. All calls block and all are bounded in
+//! time. Times are of one clock per robot, see [`Clock`].
+
+pub mod config;
+pub mod description;
+mod traits;
+
+pub use config::{Config, ConfigError};
+pub use description::{Description, DescriptionError};
+pub use traits::{
+    Advertisement, Camera, Clock, DeviceError, Head, JointReading, LedCommand, Robot, Side,
+    TagAddress, TagLink, TagState,
+};

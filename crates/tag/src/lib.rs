@@ -1,0 +1,20 @@
+//! What a smart tag is: its record of the object, its LED pattern, the commands it obeys.
+//!
+//! Shared by the robot and the firmware, therefore `no_std` and without a heap: strings and lists
+//! have fixed capacities. [`Record`] is Table 1 of the paper and a little more; [`cbor`] is its wire
+//! form (RFC 8949, schema in `docs/record.cddl`); [`Pattern`] is what the LED plays. With the
+//! feature `std` (default) the record also reads and writes as JSON or TOML through serde.
+#![cfg_attr(not(feature = "std"), no_std)]
+
+pub mod cbor;
+pub mod pattern;
+pub mod record;
+
+pub use cbor::RecordError;
+pub use pattern::{Pattern, PatternError};
+pub use record::{
+    BoundingBox, Invalid, LandmarkSite, Mobility, Physical, Record, Semantic, Shape, Text,
+};
+
+/// A position, direction or pair in the object frame as plain numbers (m).
+pub type Vec3 = [f64; 3];
