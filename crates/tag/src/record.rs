@@ -70,6 +70,8 @@ impl BoundingBox {
 }
 
 /// The form of the object; every form is centred in the bounding box.
+// A mesh is large and cannot be boxed: the firmware has no heap.
+#[allow(clippy::large_enum_variant)]
 #[derive(Debug, Clone, PartialEq)]
 #[cfg_attr(feature = "std", derive(serde::Serialize, serde::Deserialize))]
 #[cfg_attr(feature = "std", serde(tag = "kind", rename_all = "snake_case"))]
