@@ -1,15 +1,22 @@
 //! One module a command: its arguments and what it does. Adding a command is a module here, a
 //! variant of [`Command`] and a line in [`run`].
 
+mod blink;
+
 use clap::Subcommand;
 
 use crate::failure::Failure;
 
 /// What the program can do.
 #[derive(Subcommand)]
-pub enum Command {}
+pub enum Command {
+    /// Find blinking landmarks in a recording.
+    Blink(blink::Args),
+}
 
 /// Runs a command; `true` when the thing asked for was achieved.
 pub fn run(command: Command) -> Result<bool, Failure> {
-    match command {}
+    match command {
+        Command::Blink(args) => blink::run(args),
+    }
 }
