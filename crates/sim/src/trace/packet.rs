@@ -37,6 +37,25 @@ impl Packet {
         Packet { origin, direction, t: reach, body: [u32::MAX; LANES], part: [0; LANES] }
     }
 
+    /// Rays of no length, to be aimed one by one.
+    #[inline(always)]
+    pub fn idle() -> Self {
+        let up = [[0.0; LANES], [0.0; LANES], [1.0; LANES]];
+        Packet::new([[0.0; LANES]; 3], up, [0.0; LANES])
+    }
+
+    /// Makes ray `i` run from one point to another.
+    #[inline(always)]
+    pub fn aim(&mut self, i: usize, from: V3, to: V3) {
+        let way = sub(to, from);
+        let length = dot(way, way).sqrt();
+        for k in 0..3 {
+            self.origin[k][i] = from[k];
+            self.direction[k][i] = way[k] / length;
+        }
+        self.t[i] = length;
+    }
+
     /// The point that ray `i` has reached.
     #[inline(always)]
     pub fn point(&self, i: usize) -> V3 {

@@ -1,7 +1,8 @@
 //! Light at the points where rays end.
 
-use super::packet::{LANES, Lane3, NEAR, Packet, V3, add_scaled, dot, normalize, sub};
-use super::shape::Solid;
+use super::Stage;
+use super::packet::{LANES, NEAR, Packet, V3, add_scaled, dot, normalize, sub};
+use super::shape::{Solid, part};
 use super::texture::Extent;
 use crate::scene::{LAYERS, Lamp, Layer, Scene};
 
@@ -16,7 +17,21 @@ struct Surface {
     view: V3,
     albedo: f32,
     body: usize,
-    hit: bool,
+    kind: Kind,
+}
+
+/// How a surface is lit.
+#[derive(Clone, Copy, Default, PartialEq)]
+enum Kind {
+    /// The ray met nothing.
+    #[default]
+    Nothing,
+    /// By shadow rays.
+    Object,
+    /// From the light map, with reflections.
+    Table,
+    /// Without shadows.
+    Room,
 }
 
 /// Which sample of a 2x2 pattern a ray takes, so that neighbours see other parts of a lamp.
@@ -33,41 +48,98 @@ pub fn cast(scene: &Scene, candidates: &[u16], packet: &mut Packet) {
 }
 
 /// Lights what the packet has hit. `pixel` is the angle of a pixel (rad), for texture filtering;
-/// `mirror` allows reflections of the scene in mirroring bodies.
+/// `mirrored` are the bodies that the table may mirror.
 #[inline(always)]
 pub fn shade(
-    scene: &Scene,
+    stage: &Stage,
     packet: &Packet,
     phase: &Phase,
     pixel: f32,
-    mirror: bool,
+    mirrored: &[u16],
     scratch: &mut Vec<u16>,
 ) -> Light {
-    let mut light = [[0.0; LAYERS]; LANES];
+    let scene = &stage.scene;
     let mut surfaces = [Surface::default(); LANES];
-    for i in 0..LANES {
-        if let Some(s) = surface(scene, packet, i, pixel) {
-            let material = &scene.bodies[s.body].material;
-            light[i][Layer::Screen as usize] = material.glow * s.albedo;
-            let up = 0.5 + 0.5 * s.normal[2];
-            let sky = scene.ambient[0] * up + scene.ambient[1] * (1.0 - up);
-            light[i][Layer::Steady as usize] = s.albedo * sky;
-            surfaces[i] = s;
+    for (i, s) in surfaces.iter_mut().enumerate() {
+        *s = surface(scene, packet, i, pixel);
+    }
+    let mut light = [[0.0; LAYERS]; LANES];
+    for (s, l) in surfaces.iter().zip(&mut light) {
+        match s.kind {
+            Kind::Nothing | Kind::Object => {}
+            Kind::Table => on_table(stage, s, l),
+            Kind::Room => in_the_open(scene, s, l),
         }
     }
-    contact(scene, &surfaces, &mut light, scratch);
-    for lamp in &scene.lamps {
-        illuminate(scene, lamp, &surfaces, phase, &mut light, scratch);
+    if let Some(cluster) = Cluster::of(&surfaces) {
+        contact(scene, &surfaces, &cluster, &mut light, scratch);
+        for lamp in &scene.lamps {
+            illuminate(scene, lamp, &surfaces, &cluster, phase, &mut light, scratch);
+        }
     }
-    if mirror {
-        reflect(scene, &surfaces, phase, pixel, &mut light);
+    if surfaces.iter().any(|s| s.kind == Kind::Table) {
+        reflect(scene, &surfaces, mirrored, pixel, &mut light);
     }
     light
 }
 
-fn surface(scene: &Scene, packet: &Packet, i: usize, pixel: f32) -> Option<Surface> {
+/// Ambient light on a surface that nothing covers.
+#[inline(always)]
+fn ambient(scene: &Scene, s: &Surface) -> f32 {
+    let up = 0.5 + 0.5 * s.normal[2];
+    s.albedo * (scene.ambient[0] * up + scene.ambient[1] * (1.0 - up))
+}
+
+/// Light that a surface sends to the viewer for a unit of light from direction `d`.
+#[inline(always)]
+fn response(scene: &Scene, s: &Surface, d: V3) -> f32 {
+    let cos = dot(s.normal, d);
+    if cos <= 0.0 {
+        return 0.0;
+    }
+    let material = &scene.bodies[s.body].material;
+    let mut share = s.albedo;
+    if material.gloss > 0.0 {
+        let mirrored = add_scaled(s.view, s.normal, -2.0 * dot(s.view, s.normal));
+        let along = dot(mirrored, d).max(0.0);
+        let sharpness = material.shininess;
+        share += material.gloss * (0.5 * sharpness as f32 + 1.0) * along.powi(sharpness);
+    }
+    cos * share
+}
+
+/// A surface lit by all lamps without shadows: walls, floor, and whatever is seen in a mirror.
+#[inline(always)]
+fn in_the_open(scene: &Scene, s: &Surface, light: &mut [f32; LAYERS]) {
+    let material = &scene.bodies[s.body].material;
+    light[Layer::Screen as usize] += material.glow * s.albedo;
+    light[Layer::Steady as usize] += ambient(scene, s);
+    for lamp in &scene.lamps {
+        let to = sub(lamp.centre, s.point);
+        let distance2 = dot(to, to).max(0.1);
+        let d = to.map(|x| x / distance2.sqrt());
+        light[lamp.layer as usize] += lamp.intensity / distance2 * response(scene, s, d);
+    }
+}
+
+/// The table: shadows from the light map.
+#[inline(always)]
+fn on_table(stage: &Stage, s: &Surface, light: &mut [f32; LAYERS]) {
+    let scene = &stage.scene;
+    let texel = stage.table_light.at(scene, s.point);
+    light[Layer::Steady as usize] += ambient(scene, s) * texel[0];
+    for (lamp, visible) in scene.lamps.iter().zip(&texel[1..]) {
+        let to = sub(lamp.centre, s.point);
+        let distance2 = dot(to, to).max(0.1);
+        let d = to.map(|x| x / distance2.sqrt());
+        light[lamp.layer as usize] += visible * lamp.intensity / distance2 * response(scene, s, d);
+    }
+}
+
+#[inline(always)]
+fn surface(scene: &Scene, packet: &Packet, i: usize, pixel: f32) -> Surface {
     let index = packet.body[i] as usize;
-    let body = scene.bodies.get(index)?;
+    let Some(body) = scene.bodies.get(index) else { return Surface::default() };
     let (point, view) = (packet.point(i), packet.heading(i));
     let local = body.placed.local(point);
     let (mut n, part) = body.placed.normal(local, packet.part[i]);
@@ -85,60 +157,89 @@ fn surface(scene: &Scene, packet: &Packet, i: usize, pixel: f32) -> Option<Surfa
         Solid::Sphere(radius) | Solid::Capsule { radius, .. } => Extent::Round(radius),
     };
     let footprint = packet.t[i] * pixel;
-    let plain_inside = part >= 2 && !matches!(body.placed.solid, Solid::Box(_));
-    let factor = match plain_inside {
+    let round_end = part >= part::TOP && !matches!(body.placed.solid, Solid::Box(_));
+    let factor = match round_end {
         true => 1.0,
         false => material.texture.factor(local, n, extent, footprint, material.seed),
     };
     let albedo = (material.albedo * factor).min(0.95);
-    Some(Surface { point, normal, view, albedo, body: index, hit: true })
+    let kind = match (body.mirror, body.shadow) {
+        (true, _) if normal[2] > 0.9 => Kind::Table,
+        (_, true) => Kind::Object,
+        _ => Kind::Room,
+    };
+    Surface { point, normal, view, albedo, body: index, kind }
 }
 
-/// Darkens the ambient light near other bodies: each hides the share of the sky that its bounding
-/// sphere covers.
+/// The points of a packet that lie on objects: middle and radius.
+struct Cluster {
+    centre: V3,
+    spread: f32,
+}
+
+impl Cluster {
+    #[inline(always)]
+    fn of(surfaces: &[Surface; LANES]) -> Option<Self> {
+        let on_objects = || surfaces.iter().filter(|s| s.kind == Kind::Object);
+        let count = on_objects().count();
+        if count == 0 {
+            return None;
+        }
+        let mut centre = [0.0; 3];
+        for s in on_objects() {
+            centre = add_scaled(centre, s.point, 1.0 / count as f32);
+        }
+        let mut spread2 = 0.0f32;
+        for s in on_objects() {
+            let d = sub(s.point, centre);
+            spread2 = spread2.max(dot(d, d));
+        }
+        Some(Cluster { centre, spread: spread2.sqrt() })
+    }
+}
+
+/// Ambient light on objects, less what their neighbours cover.
 #[inline(always)]
-fn contact(scene: &Scene, surfaces: &[Surface; LANES], light: &mut Light, near: &mut Vec<u16>) {
-    let Some((centre, spread)) = extent_of(surfaces) else { return };
+fn contact(
+    scene: &Scene,
+    surfaces: &[Surface; LANES],
+    cluster: &Cluster,
+    light: &mut Light,
+    near: &mut Vec<u16>,
+) {
+    neighbours(scene, cluster.centre, cluster.spread, near);
+    for (s, l) in surfaces.iter().zip(light.iter_mut()).filter(|(s, _)| s.kind == Kind::Object) {
+        let open = openness(scene, near, s.body, s.point, s.normal);
+        l[Layer::Steady as usize] += ambient(scene, s) * open;
+    }
+}
+
+/// Bodies near enough to darken points around a place.
+pub fn neighbours(scene: &Scene, centre: V3, spread: f32, near: &mut Vec<u16>) {
     near.clear();
     for (index, body) in scene.bodies.iter().enumerate() {
         let d = sub(body.placed.centre(), centre);
-        let reach = spread + 3.0 * body.placed.bound();
+        let reach = spread + 4.0 * body.placed.bound();
         if body.shadow && dot(d, d) < reach * reach {
             near.push(index as u16);
         }
     }
-    for (s, l) in surfaces.iter().zip(light.iter_mut()).filter(|(s, _)| s.hit) {
-        let mut open = 1.0;
-        for &index in near.iter().filter(|&&k| usize::from(k) != s.body) {
-            let placed = &scene.bodies[usize::from(index)].placed;
-            let d = sub(placed.centre(), s.point);
-            let d2 = dot(d, d);
-            // The bounding sphere is larger than the body: 0.6 of its section is about right.
-            let share = 0.6 * placed.bound() * placed.bound() / d2;
-            let cos = dot(d, s.normal) / d2.sqrt();
-            open *= 1.0 - (share * cos.max(0.0)).min(0.75);
-        }
-        l[Layer::Steady as usize] *= open;
-    }
 }
 
-/// Middle and radius of the points hit.
+/// Share of the sky that neighbours leave open: each hides what its bounding sphere covers.
 #[inline(always)]
-fn extent_of(surfaces: &[Surface; LANES]) -> Option<(V3, f32)> {
-    let count = surfaces.iter().filter(|s| s.hit).count();
-    if count == 0 {
-        return None;
+pub fn openness(scene: &Scene, near: &[u16], own: usize, point: V3, normal: V3) -> f32 {
+    let mut open = 1.0;
+    for &index in near.iter().filter(|&&k| usize::from(k) != own) {
+        let placed = &scene.bodies[usize::from(index)].placed;
+        let d = sub(placed.centre(), point);
+        let d2 = dot(d, d).max(1e-6);
+        // The bounding sphere is larger than the body: 0.6 of its section is about right.
+        let share = 0.6 * placed.bound() * placed.bound() / d2;
+        let cos = dot(d, normal) / d2.sqrt();
+        open *= 1.0 - (share * cos.max(0.0)).min(0.75);
     }
-    let mut centre = [0.0; 3];
-    for s in surfaces.iter().filter(|s| s.hit) {
-        centre = add_scaled(centre, s.point, 1.0 / count as f32);
-    }
-    let mut spread2 = 0.0f32;
-    for s in surfaces.iter().filter(|s| s.hit) {
-        let d = sub(s.point, centre);
-        spread2 = spread2.max(dot(d, d));
-    }
-    Some((centre, spread2.sqrt()))
+    open
 }
 
 /// Places of the shadow probes on a lamp, in units of its half edges; four a pixel, another four
@@ -153,99 +254,75 @@ const PROBES: [[[f32; 2]; 4]; 4] = {
     ]
 };
 
-/// Adds a lamp's diffuse light and highlight with soft shadows.
+/// Target of a shadow ray on a lamp.
+#[inline(always)]
+pub fn lamp_point(lamp: &Lamp, phase: usize, probe: usize) -> V3 {
+    let [u, v] = PROBES[phase & 3][probe & 3];
+    add_scaled(add_scaled(lamp.centre, lamp.edges[0], u), lamp.edges[1], v)
+}
+
+/// Adds a lamp's light on objects, with soft shadows.
 #[inline(always)]
 fn illuminate(
     scene: &Scene,
     lamp: &Lamp,
     surfaces: &[Surface; LANES],
+    cluster: &Cluster,
     phase: &Phase,
     light: &mut Light,
     near: &mut Vec<u16>,
 ) {
-    let Some((centre, spread)) = extent_of(surfaces) else { return };
-    let size = lamp.edges.iter().map(|e| dot(*e, *e)).sum::<f32>().sqrt();
-    between(scene, centre, spread, lamp.centre, size, near);
+    between(scene, cluster.centre, cluster.spread, lamp, near);
     for probe in 0..4 {
-        let (mut origin, mut direction) =
-            ([[0.0; LANES]; 3], [[0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0]; 3]);
-        let mut reach = [0.0; LANES];
-        for (i, s) in surfaces.iter().enumerate().filter(|(_, s)| s.hit) {
-            let [u, v] = PROBES[usize::from(phase[i] & 3)][probe];
-            let target = add_scaled(add_scaled(lamp.centre, lamp.edges[0], u), lamp.edges[1], v);
+        let mut packet = Packet::idle();
+        for (i, s) in surfaces.iter().enumerate().filter(|(_, s)| s.kind == Kind::Object) {
             let from = add_scaled(s.point, s.normal, NEAR);
-            let to = sub(target, from);
-            let distance = dot(to, to).sqrt();
-            for k in 0..3 {
-                origin[k][i] = from[k];
-                direction[k][i] = to[k] / distance;
-            }
-            reach[i] = distance;
+            packet.aim(i, from, lamp_point(lamp, usize::from(phase[i]), probe));
         }
-        let mut packet = Packet::new(origin, direction, reach);
+        let reach = packet.t;
         cast(scene, near, &mut packet);
-        for (i, s) in surfaces.iter().enumerate() {
-            let d = packet.heading(i);
-            let cos = dot(s.normal, d);
-            if !s.hit || packet.body[i] != u32::MAX || cos <= 0.0 {
-                continue;
+        for (i, s) in surfaces.iter().enumerate().filter(|(_, s)| s.kind == Kind::Object) {
+            if packet.body[i] == u32::MAX {
+                let strength = 0.25 * lamp.intensity / (reach[i] * reach[i]).max(0.1);
+                light[i][lamp.layer as usize] += strength * response(scene, s, packet.heading(i));
             }
-            let material = &scene.bodies[s.body].material;
-            let strength = 0.25 * lamp.intensity / (reach[i] * reach[i]).max(1e-3);
-            let mirrored = add_scaled(s.view, s.normal, -2.0 * dot(s.view, s.normal));
-            let shine = match material.gloss > 0.0 {
-                true => {
-                    let along = dot(mirrored, d).max(0.0);
-                    material.gloss
-                        * 0.5
-                        * (material.shininess + 2.0)
-                        * along.powf(material.shininess)
-                }
-                false => 0.0,
-            };
-            light[i][lamp.layer as usize] += strength * cos * (s.albedo + shine);
         }
     }
 }
 
-/// Reflections of the scene in mirroring bodies (Schlick's law).
+/// Reflections of the scene in the table (Schlick's law).
 #[inline(always)]
 fn reflect(
     scene: &Scene,
     surfaces: &[Surface; LANES],
-    phase: &Phase,
+    mirrored: &[u16],
     pixel: f32,
     light: &mut Light,
 ) {
-    let mirrors = |s: &Surface| s.hit && scene.bodies[s.body].mirror;
-    if !surfaces.iter().any(mirrors) {
-        return;
-    }
-    let (mut origin, mut direction): (Lane3, Lane3) = ([[0.0; LANES]; 3], [[1.0; LANES]; 3]);
-    let mut reach = [0.0; LANES];
+    let mut packet = Packet::idle();
     let mut share = [0.0; LANES];
-    for (i, s) in surfaces.iter().enumerate().filter(|(_, s)| mirrors(s)) {
+    for (i, s) in surfaces.iter().enumerate().filter(|(_, s)| s.kind == Kind::Table) {
         let cos = -dot(s.view, s.normal);
-        let mirrored = normalize(add_scaled(s.view, s.normal, 2.0 * cos));
+        let direction = normalize(add_scaled(s.view, s.normal, 2.0 * cos));
         for k in 0..3 {
-            origin[k][i] = s.point[k] + NEAR * s.normal[k];
-            direction[k][i] = mirrored[k];
+            packet.origin[k][i] = s.point[k] + NEAR * s.normal[k];
+            packet.direction[k][i] = direction[k];
         }
-        reach[i] = f32::INFINITY;
+        packet.t[i] = f32::INFINITY;
         let gloss = scene.bodies[s.body].material.gloss;
         share[i] = gloss + (1.0 - gloss) * 0.6 * (1.0 - cos).clamp(0.0, 1.0).powi(5);
     }
-    let mut packet = Packet::new(origin, direction, reach);
-    for (index, body) in scene.bodies.iter().enumerate() {
-        body.placed.intersect(&mut packet, index as u32);
-    }
-    // A rough table blurs what it mirrors: textures are filtered as if ten pixels wide.
-    let mut scratch = Vec::new();
-    let mirrored = shade(scene, &packet, phase, 10.0 * pixel, false, &mut scratch);
+    cast(scene, mirrored, &mut packet);
     for i in 0..LANES {
         if share[i] > 0.0 {
-            for (l, m) in light[i].iter_mut().zip(mirrored[i]) {
-                *l += share[i] * m;
+            // A rough table blurs what it mirrors: textures are filtered as if ten pixels wide.
+            let s = surface(scene, &packet, i, 10.0 * pixel);
+            if s.kind != Kind::Nothing {
+                let mut seen = [0.0; LAYERS];
+                in_the_open(scene, &s, &mut seen);
+                for (l, m) in light[i].iter_mut().zip(seen) {
+                    *l += share[i] * m;
+                }
             }
         }
     }
@@ -253,9 +330,10 @@ fn reflect(
 
 /// Bodies that may throw a shadow between a cluster of points and a lamp.
 #[inline(always)]
-fn between(scene: &Scene, from: V3, spread: f32, to: V3, size: f32, near: &mut Vec<u16>) {
+pub fn between(scene: &Scene, from: V3, spread: f32, lamp: &Lamp, near: &mut Vec<u16>) {
     near.clear();
-    let axis = sub(to, from);
+    let size = lamp.edges.iter().map(|e| dot(*e, *e)).sum::<f32>().sqrt();
+    let axis = sub(lamp.centre, from);
     let length2 = dot(axis, axis).max(1e-9);
     for (index, body) in scene.bodies.iter().enumerate().filter(|(_, b)| b.shadow) {
         let c = sub(body.placed.centre(), from);

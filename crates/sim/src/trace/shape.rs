@@ -259,12 +259,17 @@ fn cone(
         let c = ox * ox + oy * oy - radius * radius;
         let root2 = b * b - a * c;
         let root = root2.max(0.0).sqrt();
-        for t in [(-b - root) / a, (-b + root) / a] {
+        let inverse = 1.0 / a;
+        let (first, second) = ((-b - root) * inverse, (-b + root) * inverse);
+        let (near, far) = (first.min(second), first.max(second));
+        let valid = |t: f32| {
             let z = oz + t * dz;
-            let hit = root2 > 0.0 && z >= ends[0] && z <= ends[1] && t > NEAR && t < best[i];
-            best[i] = if hit { t } else { best[i] };
-            part[i] = if hit { which } else { part[i] };
-        }
+            (z >= ends[0]) & (z <= ends[1]) & (t > NEAR)
+        };
+        let t = if valid(near) { near } else { far };
+        let hit = valid(t) & (root2 > 0.0) & (t < best[i]);
+        best[i] = if hit { t } else { best[i] };
+        part[i] = if hit { which } else { part[i] };
     }
 }
 
