@@ -1,7 +1,8 @@
 //! Eight rays at a time.
 //!
 //! Plain `[f32; 8]` loops that the compiler turns into vector code; one packet holds eight pixels,
-//! or eight samples of one pixel, lamp or LED.
+//! or eight samples of one pixel, lamp or LED. Vectors are written out: the closures of
+//! `array::map` are not inlined into functions that are compiled for wider vector units.
 
 /// Rays in a packet.
 pub const LANES: usize = 8;
@@ -59,13 +60,14 @@ impl Packet {
     /// The point that ray `i` has reached.
     #[inline(always)]
     pub fn point(&self, i: usize) -> V3 {
-        [0, 1, 2].map(|k| self.origin[k][i] + self.t[i] * self.direction[k][i])
+        let (o, d, t) = (&self.origin, &self.direction, self.t[i]);
+        [o[0][i] + t * d[0][i], o[1][i] + t * d[1][i], o[2][i] + t * d[2][i]]
     }
 
     /// Direction of ray `i`.
     #[inline(always)]
     pub fn heading(&self, i: usize) -> V3 {
-        [0, 1, 2].map(|k| self.direction[k][i])
+        [self.direction[0][i], self.direction[1][i], self.direction[2][i]]
     }
 }
 
@@ -87,9 +89,14 @@ pub fn add_scaled(a: V3, b: V3, s: f32) -> V3 {
     [a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]]
 }
 
+/// `s a`.
+#[inline(always)]
+pub fn scaled(a: V3, s: f32) -> V3 {
+    [a[0] * s, a[1] * s, a[2] * s]
+}
+
 /// Unit vector.
 #[inline(always)]
 pub fn normalize(a: V3) -> V3 {
-    let scale = 1.0 / dot(a, a).sqrt().max(1e-20);
-    a.map(|x| x * scale)
+    scaled(a, 1.0 / dot(a, a).sqrt().max(1e-20))
 }

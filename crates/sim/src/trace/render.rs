@@ -80,7 +80,7 @@ impl Eye {
 
     #[inline(always)]
     fn turn(&self, d: V3) -> V3 {
-        self.rows.map(|row| dot(row, d))
+        [dot(self.rows[0], d), dot(self.rows[1], d), dot(self.rows[2], d)]
     }
 }
 
@@ -150,7 +150,8 @@ fn primary(grid: &RayGrid, eye: &Eye, pixel: impl Fn(usize) -> (usize, usize, [f
             direction[k][i] = d[k];
         }
     }
-    let origin = eye.position.map(|p| [p; LANES]);
+    let p = eye.position;
+    let origin = [[p[0]; LANES], [p[1]; LANES], [p[2]; LANES]];
     Packet::new(origin, direction, [f32::INFINITY; LANES])
 }
 

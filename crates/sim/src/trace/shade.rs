@@ -1,7 +1,7 @@
 //! Light at the points where rays end.
 
 use super::Stage;
-use super::packet::{LANES, NEAR, Packet, V3, add_scaled, dot, normalize, sub};
+use super::packet::{LANES, NEAR, Packet, V3, add_scaled, dot, normalize, scaled, sub};
 use super::shape::{Solid, part};
 use super::texture::Extent;
 use crate::scene::{LAYERS, Lamp, Layer, Scene};
@@ -59,10 +59,7 @@ pub fn shade(
     scratch: &mut Vec<u16>,
 ) -> Light {
     let scene = &stage.scene;
-    let mut surfaces = [Surface::default(); LANES];
-    for (i, s) in surfaces.iter_mut().enumerate() {
-        *s = surface(scene, packet, i, pixel);
-    }
+    let surfaces = surfaces(scene, packet, pixel);
     let mut light = [[0.0; LAYERS]; LANES];
     for (s, l) in surfaces.iter().zip(&mut light) {
         match s.kind {
@@ -102,8 +99,10 @@ fn response(scene: &Scene, s: &Surface, d: V3) -> f32 {
     if material.gloss > 0.0 {
         let mirrored = add_scaled(s.view, s.normal, -2.0 * dot(s.view, s.normal));
         let along = dot(mirrored, d).max(0.0);
-        let sharpness = material.shininess;
-        share += material.gloss * (0.5 * sharpness as f32 + 1.0) * along.powi(sharpness);
+        // Phong's lobe with exponent 32, normalised.
+        let a2 = along * along;
+        let a8 = (a2 * a2) * (a2 * a2);
+        share += material.gloss * 17.0 * (a8 * a8) * (a8 * a8);
     }
     cos * share
 }
@@ -117,7 +116,7 @@ fn in_the_open(scene: &Scene, s: &Surface, light: &mut [f32; LAYERS]) {
     for lamp in &scene.lamps {
         let to = sub(lamp.centre, s.point);
         let distance2 = dot(to, to).max(0.1);
-        let d = to.map(|x| x / distance2.sqrt());
+        let d = scaled(to, 1.0 / distance2.sqrt());
         light[lamp.layer as usize] += lamp.intensity / distance2 * response(scene, s, d);
     }
 }
@@ -131,44 +130,70 @@ fn on_table(stage: &Stage, s: &Surface, light: &mut [f32; LAYERS]) {
     for (lamp, visible) in scene.lamps.iter().zip(&texel[1..]) {
         let to = sub(lamp.centre, s.point);
         let distance2 = dot(to, to).max(0.1);
-        let d = to.map(|x| x / distance2.sqrt());
+        let d = scaled(to, 1.0 / distance2.sqrt());
         light[lamp.layer as usize] += visible * lamp.intensity / distance2 * response(scene, s, d);
     }
 }
 
+/// What the eight rays have met.
 #[inline(always)]
-fn surface(scene: &Scene, packet: &Packet, i: usize, pixel: f32) -> Surface {
-    let index = packet.body[i] as usize;
-    let Some(body) = scene.bodies.get(index) else { return Surface::default() };
-    let (point, view) = (packet.point(i), packet.heading(i));
-    let local = body.placed.local(point);
-    let (mut n, part) = body.placed.normal(local, packet.part[i]);
-    let mut normal = body.placed.outward(n);
-    if dot(normal, view) > 0.0 {
-        normal = normal.map(|x| -x);
-        n = n.map(|x| -x);
-    }
-    let material = &body.material;
-    let extent = match body.placed.solid {
-        Solid::Box(half) => Extent::Flat(half),
-        Solid::Frustum { bottom, top, .. } | Solid::Cup { bottom, top, .. } => {
-            Extent::Round(0.5 * (bottom + top))
+fn surfaces(scene: &Scene, packet: &Packet, pixel: f32) -> [Surface; LANES] {
+    let mut surfaces = [Surface::default(); LANES];
+    let (mut local, mut normals) = ([[0.0; LANES]; 3], [[0.0; LANES]; 3]);
+    let mut plain = [false; LANES];
+    for (i, s) in surfaces.iter_mut().enumerate() {
+        let index = packet.body[i] as usize;
+        let Some(body) = scene.bodies.get(index) else { continue };
+        let (point, view) = (packet.point(i), packet.heading(i));
+        let p = body.placed.local(point);
+        let (mut n, part) = body.placed.normal(p, packet.part[i]);
+        let mut normal = body.placed.outward(n);
+        if dot(normal, view) > 0.0 {
+            normal = scaled(normal, -1.0);
+            n = scaled(n, -1.0);
         }
-        Solid::Sphere(radius) | Solid::Capsule { radius, .. } => Extent::Round(radius),
-    };
-    let footprint = packet.t[i] * pixel;
-    let round_end = part >= part::TOP && !matches!(body.placed.solid, Solid::Box(_));
-    let factor = match round_end {
-        true => 1.0,
-        false => material.texture.factor(local, n, extent, footprint, material.seed),
-    };
-    let albedo = (material.albedo * factor).min(0.95);
-    let kind = match (body.mirror, body.shadow) {
-        (true, _) if normal[2] > 0.9 => Kind::Table,
-        (_, true) => Kind::Object,
-        _ => Kind::Room,
-    };
-    Surface { point, normal, view, albedo, body: index, kind }
+        for k in 0..3 {
+            local[k][i] = p[k];
+            normals[k][i] = n[k];
+        }
+        plain[i] = part >= part::TOP && !matches!(body.placed.solid, Solid::Box(_));
+        let kind = match (body.mirror, body.shadow) {
+            (true, _) if normal[2] > 0.9 => Kind::Table,
+            (_, true) => Kind::Object,
+            _ => Kind::Room,
+        };
+        *s = Surface { point, normal, view, albedo: 0.0, body: index, kind };
+    }
+    let mut footprint = packet.t;
+    for f in &mut footprint {
+        *f *= pixel;
+    }
+    // Textures of all eight lanes at once; packets rarely show more than one body.
+    let mut done = [false; LANES];
+    for i in 0..LANES {
+        if done[i] || surfaces[i].kind == Kind::Nothing {
+            continue;
+        }
+        let index = surfaces[i].body;
+        let body = &scene.bodies[index];
+        let material = &body.material;
+        let extent = match body.placed.solid {
+            Solid::Box(half) => Extent::Flat(half),
+            Solid::Frustum { bottom, top, .. } | Solid::Cup { bottom, top, .. } => {
+                Extent::Round(0.5 * (bottom + top))
+            }
+            Solid::Sphere(radius) | Solid::Capsule { radius, .. } => Extent::Round(radius),
+        };
+        let factors = material.texture.factors(&local, &normals, extent, &footprint, material.seed);
+        for j in i..LANES {
+            if surfaces[j].kind != Kind::Nothing && surfaces[j].body == index {
+                done[j] = true;
+                let factor = if plain[j] { 1.0 } else { factors[j] };
+                surfaces[j].albedo = (material.albedo * factor).min(0.95);
+            }
+        }
+    }
+    surfaces
 }
 
 /// The points of a packet that lie on objects: middle and radius.
@@ -313,17 +338,13 @@ fn reflect(
         share[i] = gloss + (1.0 - gloss) * 0.6 * (1.0 - cos).clamp(0.0, 1.0).powi(5);
     }
     cast(scene, mirrored, &mut packet);
-    for i in 0..LANES {
-        if share[i] > 0.0 {
-            // A rough table blurs what it mirrors: textures are filtered as if ten pixels wide.
-            let s = surface(scene, &packet, i, 10.0 * pixel);
-            if s.kind != Kind::Nothing {
-                let mut seen = [0.0; LAYERS];
-                in_the_open(scene, &s, &mut seen);
-                for (l, m) in light[i].iter_mut().zip(seen) {
-                    *l += share[i] * m;
-                }
-            }
+    // A rough table blurs what it mirrors: textures are filtered as if ten pixels wide.
+    let seen = self::surfaces(scene, &packet, 10.0 * pixel);
+    for (i, s) in seen.iter().enumerate().filter(|(_, s)| s.kind != Kind::Nothing) {
+        let mut mirrored = [0.0; LAYERS];
+        in_the_open(scene, s, &mut mirrored);
+        for (l, m) in light[i].iter_mut().zip(mirrored) {
+            *l += share[i] * m;
         }
     }
 }
