@@ -92,7 +92,16 @@ impl Sensor {
             .map(|k| 255.0 * (k as f64 / RESPONSE as f64).powf(1.0 / settings.gamma) as f32)
             .collect();
         let flicker = Flicker::new(light, seed);
-        Sensor { lens, grid: RayGrid::new(&lens), settings, flicker, response, seed, side, still: None }
+        Sensor {
+            lens,
+            grid: RayGrid::new(&lens),
+            settings,
+            flicker,
+            response,
+            seed,
+            side,
+            still: None,
+        }
     }
 
     /// The picture of a capture.
@@ -149,7 +158,8 @@ impl Sensor {
         }
         // The mirrored light: the image of the emitter below the table.
         let height = scene.table_height;
-        let below = Point3::new(emitter.position.x, emitter.position.y, 2.0 * height - emitter.position.z);
+        let below =
+            Point3::new(emitter.position.x, emitter.position.y, 2.0 * height - emitter.position.z);
         let Some(table) = scene.bodies.iter().find(|body| body.mirror) else { return };
         if eye.z <= height || emitter.position.z <= height {
             return;

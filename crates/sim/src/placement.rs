@@ -165,8 +165,7 @@ fn handle(
         let (a, b) = (at(k), at(k + 1));
         let turn = UnitQuaternion::rotation_between(&Vector3::z(), &(b - a)).unwrap_or_default();
         let place = Transform::from_parts(Translation3::from(nalgebra::center(&a, &b)), turn);
-        let solid =
-            Solid::Capsule { half: 0.5 * (b - a).norm() as f32, radius: thick as f32 };
+        let solid = Solid::Capsule { half: 0.5 * (b - a).norm() as f32, radius: thick as f32 };
         Body::new(solid, &(base_from_object * place), plain)
     })
 }
@@ -321,8 +320,15 @@ impl Builder {
             let object = TaggedObject { record: record.clone(), base_from_object };
             let fixed = settings.at.is_some();
             let fits = self.free(x, y, radius)
-                && (fixed || self.unseen_at_rest(&Point3::new(x, y, 0.5 * h), 0.5 * record.bounding_box.diagonal()))
-                && record.landmarks.iter().all(|site| fixed || self.in_sight(&object.landmark(site)));
+                && (fixed
+                    || self.unseen_at_rest(
+                        &Point3::new(x, y, 0.5 * h),
+                        0.5 * record.bounding_box.diagonal(),
+                    ))
+                && record
+                    .landmarks
+                    .iter()
+                    .all(|site| fixed || self.in_sight(&object.landmark(site)));
             if fits {
                 let bodies = object_bodies(settings, &base_from_object, self.housing, rng)?;
                 self.scene.bodies.extend(bodies);
@@ -337,7 +343,12 @@ impl Builder {
     }
 
     /// Adds a body unless it hides more of the objects than allowed; returns whether it stayed.
-    fn try_add(&mut self, body: Body, objects: &[TaggedObject], hides: impl Fn(&Self) -> bool) -> bool {
+    fn try_add(
+        &mut self,
+        body: Body,
+        objects: &[TaggedObject],
+        hides: impl Fn(&Self) -> bool,
+    ) -> bool {
         let before = self.scene.bodies.len();
         self.scene.bodies.push(body);
         let landmarks_seen = objects

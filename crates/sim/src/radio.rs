@@ -137,7 +137,12 @@ fn reach(world: &World, address: TagAddress) -> Option<usize> {
 }
 
 /// Lets the radio work for some time; an error when it takes longer than allowed.
-fn spend(world: &mut World, time: f64, deadline: f64, timeout: Duration) -> Result<(), DeviceError> {
+fn spend(
+    world: &mut World,
+    time: f64,
+    deadline: f64,
+    timeout: Duration,
+) -> Result<(), DeviceError> {
     let end = world.seconds() + time;
     world.advance_to(Duration::from_secs_f64(end.min(deadline)));
     match end <= deadline {

@@ -64,12 +64,7 @@ pub struct Body {
 impl Body {
     /// A body that throws shadows.
     pub fn new(solid: Solid, base_from_body: &Transform, material: Material) -> Self {
-        Body {
-            placed: Placed::new(solid, base_from_body),
-            material,
-            shadow: true,
-            mirror: false,
-        }
+        Body { placed: Placed::new(solid, base_from_body), material, shadow: true, mirror: false }
     }
 }
 

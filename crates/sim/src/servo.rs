@@ -66,7 +66,8 @@ impl Servo {
             return;
         }
         self.motor = self.profile(time);
-        self.load = self.load.clamp(self.motor - 0.5 * self.backlash, self.motor + 0.5 * self.backlash);
+        self.load =
+            self.load.clamp(self.motor - 0.5 * self.backlash, self.motor + 0.5 * self.backlash);
         self.time = time;
     }
 

@@ -213,13 +213,20 @@ pub fn settings(config: &Config) -> Result<SimConfig, SimError> {
 }
 
 /// The head as built: the URDF's, off by the configured errors.
-fn true_head(settings: &SimConfig, mut chain: Chain, mut lens: Lens, seed: u64, side: Side) -> TrueHead {
+fn true_head(
+    settings: &SimConfig,
+    mut chain: Chain,
+    mut lens: Lens,
+    seed: u64,
+    side: Side,
+) -> TrueHead {
     let GeometryError { joint_zero_deg, axis_skew_deg, lever_arm, focal_ratio } =
         settings.geometry_error;
     let mut rng = stream(seed, "geometry", side as u64);
     for joint in &mut chain.joints {
         let skew = Vector3::from_fn(|_, _| normal(&mut rng)) * axis_skew_deg.to_radians();
-        joint.axis = Unit::new_normalize(UnitQuaternion::from_scaled_axis(skew) * joint.axis.into_inner());
+        joint.axis =
+            Unit::new_normalize(UnitQuaternion::from_scaled_axis(skew) * joint.axis.into_inner());
         let zero = normal(&mut rng) * joint_zero_deg.to_radians();
         let turn = UnitQuaternion::from_axis_angle(&joint.axis, zero);
         joint.parent_from_joint *= Transform::from_parts(Default::default(), turn);

@@ -138,7 +138,13 @@ impl World {
             blinkers.extend(self.status.clone());
             let scene = self.scene.clone();
             let sequence = self.frame;
-            self.captures.push_back(Capture { sequence, start, base_from_optical, blinkers, scene });
+            self.captures.push_back(Capture {
+                sequence,
+                start,
+                base_from_optical,
+                blinkers,
+                scene,
+            });
             while self.captures.len() > self.settings.camera.buffer_frames {
                 self.captures.pop_front();
             }

@@ -3,7 +3,7 @@
 use super::packet::{LANES, Lane3, NEAR, Packet, V3, add_scaled, dot, normalize, sub};
 use super::shape::Solid;
 use super::texture::Extent;
-use crate::scene::{LAYERS, Layer, Lamp, Scene};
+use crate::scene::{LAYERS, Lamp, Layer, Scene};
 
 /// Light of every layer at the eight ends of a packet.
 pub type Light = [[f32; LAYERS]; LANES];
@@ -167,7 +167,8 @@ fn illuminate(
     let size = lamp.edges.iter().map(|e| dot(*e, *e)).sum::<f32>().sqrt();
     between(scene, centre, spread, lamp.centre, size, near);
     for probe in 0..4 {
-        let (mut origin, mut direction) = ([[0.0; LANES]; 3], [[0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0]; 3]);
+        let (mut origin, mut direction) =
+            ([[0.0; LANES]; 3], [[0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0]; 3]);
         let mut reach = [0.0; LANES];
         for (i, s) in surfaces.iter().enumerate().filter(|(_, s)| s.hit) {
             let [u, v] = PROBES[usize::from(phase[i] & 3)][probe];
@@ -195,7 +196,10 @@ fn illuminate(
             let shine = match material.gloss > 0.0 {
                 true => {
                     let along = dot(mirrored, d).max(0.0);
-                    material.gloss * 0.5 * (material.shininess + 2.0) * along.powf(material.shininess)
+                    material.gloss
+                        * 0.5
+                        * (material.shininess + 2.0)
+                        * along.powf(material.shininess)
                 }
                 false => 0.0,
             };

@@ -113,7 +113,11 @@ fn lettering(u: f32, v: f32, size: [f32; 2], footprint: f32, seed: u32) -> f32 {
     let emblem = bar(0.13, 0.22, r, f) + bar(-1.0, 0.07, r, f);
     let word = |row: i32, cell: f32| {
         let k = (x / cell).floor() as i32;
-        if lattice(k, row, 0, seed) > 0.3 { bar(0.12, 0.88, x / cell - k as f32, f / cell) } else { 0.0 }
+        if lattice(k, row, 0, seed) > 0.3 {
+            bar(0.12, 0.88, x / cell - k as f32, f / cell)
+        } else {
+            0.0
+        }
     };
     let title = bar(0.66, 0.84, y, f) * word(0, 0.09) * bar(0.46, 0.92, x, f);
     let row = (y / 0.09).floor() as i32;
@@ -140,7 +144,8 @@ impl Texture {
             Texture::Wood => {
                 let board = (p[1] / 0.14).floor() as i32;
                 let tone = 0.12 * (lattice(board, 0, 0, seed) - 0.5);
-                let joint = 1.0 - 0.5 * bar(-0.001, 0.001, p[1] - (p[1] / 0.14).round() * 0.14, footprint) ;
+                let joint =
+                    1.0 - 0.5 * bar(-0.001, 0.001, p[1] - (p[1] / 0.14).round() * 0.14, footprint);
                 let fibre = [p[0] * 0.12, p[1] + 0.02 * noise(p.map(|x| x * 3.0), seed), p[2]];
                 let offset = [board as f32 * 7.3, 0.0, 0.0];
                 let at = [0, 1, 2].map(|k| fibre[k] + offset[k]);
