@@ -139,6 +139,22 @@ fn a_crash_leaves_a_readable_start() {
 }
 
 #[test]
+fn a_damaged_chunk_does_not_take_the_others_with_it() {
+    let file = Scratch::new("bit-rot");
+    write(&file.0, 800);
+    let mut bytes = std::fs::read(&file.0).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 1;
+    std::fs::write(&file.0, &bytes).unwrap();
+    let read: Vec<_> = frames(&file.0, IMAGES, EXPOSURE).unwrap().collect();
+    let errors: Vec<String> =
+        read.iter().filter_map(|f| f.as_ref().err().map(ToString::to_string)).collect();
+    assert!(matches!(errors.as_slice(), [only] if only.contains("Chunk CRC failed")), "{errors:?}");
+    let last = read.into_iter().filter_map(Result::ok).last();
+    assert_eq!(last.unwrap().stamp, frame(799).stamp);
+}
+
+#[test]
 fn errors_say_what_is_there() {
     let file = Scratch::new("errors");
     write(&file.0, 2);

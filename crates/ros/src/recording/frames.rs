@@ -35,8 +35,8 @@ pub struct Frames {
 /// in order, one that comes later than that or repeats a stamp is left out. `sequence` is the
 /// running number on the topic, `row_time` unknown.
 ///
-/// A picture that cannot be decoded is an error, after which the next one follows; a damaged file
-/// ends the iteration.
+/// A picture or a chunk that cannot be decoded is an error, after which the next one follows;
+/// damage to the file's framing ends the iteration.
 pub fn frames(path: &Path, topic: &str, exposure: Duration) -> Result<Frames, RecordingError> {
     Ok(Frames {
         raw: OfTopic::open(path, topic)?,
