@@ -1,6 +1,7 @@
 //! Speed of recording and of reading back, in bytes of pixels: 90 pictures (3 s at 30 Hz).
 //!
 //! `cargo bench -p vergence-ros`
+#![expect(clippy::unwrap_used, reason = "a bench that cannot work stops")]
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
