@@ -1,5 +1,6 @@
 //! Every message type against bytes and definitions that another implementation made, and against
 //! arbitrary bytes.
+#![expect(clippy::unwrap_used, reason = "a test that cannot go on fails")]
 
 use proptest::prelude::*;
 use serde_json::Value;
