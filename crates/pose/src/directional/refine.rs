@@ -3,15 +3,20 @@
 //! **In:** a pose that is right to a few pixels. **Out:** the pose that maximises the likelihood of
 //! a mixture: every site's edge is one of its candidates with Gaussian error, or none. Solved by
 //! Gauss-Newton on the expected assignments (EM), the edge deviation shrinking from pass to pass
-//! (annealing). The cameras' small turns are nuisance unknowns with a prior, eliminated view by
-//! view (Schur complement). The landmark is a measurement of three numbers with its covariance.
+//! (annealing). The landmark is a measurement of three numbers with its covariance.
+//!
+//! Nuisance unknowns with priors take up what would else bias the pose: the object's size is not
+//! exactly the record's, the cameras' angles are known to the servos' accuracy, and silhouettes
+//! appear a fraction of a pixel off (rounded edges, blooming, gamma). Those that belong to one view
+//! are eliminated view by view (Schur complement). The foot of a standing object, where the shadow
+//! begins, is measured only coarsely.
 
-use nalgebra::{Matrix2, Matrix3, Matrix3x6, Matrix6, Matrix6x2, Vector2, Vector3, Vector6};
+use nalgebra::{Matrix3, Matrix6, SMatrix, SVector, Vector3};
 use vergence_geometry::gaussian::{perturb, skew};
 use vergence_geometry::Transform;
 
 use super::search::Search;
-use super::sites::{Layout, Site, sites};
+use super::sites::{Layout, Nuisance, Site, State, sites};
 use crate::model::Kind;
 
 /// Standard deviation of an edge's place once the pose is right (px): aliasing, gamma, blooming and
@@ -34,6 +39,18 @@ pub fn absence(kind: Kind) -> f64 {
     }
 }
 
+/// Deviation of the foot's edge (px): contact shadows and rounded edges blur where it is.
+const CONTACT_SD_PX: f64 = 1.2;
+/// Deviation of the swelling of silhouettes (px).
+const SWELL_SD_PX: f64 = 0.3;
+/// Deviation of the logarithm of the object's size: half a percent.
+const SIZE_SD: f64 = 0.005;
+
+/// Deviation of a site's edge when a pass works with `sd`.
+pub fn deviation(site: &Site, sd: f64) -> f64 {
+    if site.contact { sd.max(CONTACT_SD_PX) } else { sd }
+}
+
 /// One pass of the refinement.
 #[derive(Debug, Clone, Copy)]
 pub struct Pass {
@@ -50,50 +67,62 @@ pub struct Pass {
 pub struct Refined {
     /// `base_from_object`.
     pub pose: Transform,
-    /// Information matrix of the pose's tangent, nuisances eliminated.
-    pub information: Matrix6<f64>,
-    /// Small turns of the cameras about their x and y axes (rad).
-    pub turns: Vec<[f64; 2]>,
+    /// Logarithm of the object's size against the record's.
+    pub log_size: f64,
+    /// Each view's own unknowns.
+    pub nuisances: Vec<Nuisance>,
+    /// Covariance of the pose's tangent as the information has it.
+    pub covariance: Matrix6<f64>,
+    /// What the priors hold against this state: half their squared normalised residuals.
+    pub strain: f64,
     /// The sites of the last pass, at the pose before its last step.
     pub sites: Vec<Site>,
 }
 
+type Matrix7 = SMatrix<f64, 7, 7>;
+type Vector7 = SVector<f64, 7>;
+
 /// Sums of one view's normal equations.
 #[derive(Default, Clone)]
 struct Normal {
-    pose: Matrix6<f64>,
-    mixed: Matrix6x2<f64>,
-    turn: Matrix2<f64>,
-    pose_rhs: Vector6<f64>,
-    turn_rhs: Vector2<f64>,
+    shared: Matrix7,
+    mixed: SMatrix<f64, 7, 3>,
+    own: Matrix3<f64>,
+    shared_rhs: Vector7,
+    own_rhs: Vector3<f64>,
+}
+
+/// Changes of the unknowns.
+#[derive(Clone)]
+struct Move {
+    shared: Vector7,
+    own: Vec<Vector3<f64>>,
 }
 
 impl Search<'_> {
     /// Refines a pose through the given passes.
     pub fn refine(&self, start: &Transform, passes: &[Pass]) -> Refined {
+        let views = self.sights.len();
         let mut refined = Refined {
             pose: *start,
-            information: Matrix6::identity(),
-            turns: vec![[0.0; 2]; self.sights.len()],
+            log_size: 0.0,
+            nuisances: vec![Nuisance::default(); views],
+            covariance: Matrix6::identity(),
+            strain: 0.0,
             sites: Vec::new(),
         };
         for pass in passes {
             self.lay_out(&mut refined, pass);
             // Two steps on the same sites: the assignments settle while the geometry is linear.
-            let mut moved = Vector6::zeros();
-            let mut turned = vec![Vector2::zeros(); self.sights.len()];
+            let mut moved = Move { shared: Vector7::zeros(), own: vec![Vector3::zeros(); views] };
             for _ in 0..2 {
-                let step = self.step(&mut refined, pass, &moved, &turned);
-                let Some((pose_step, turn_steps)) = step else { break };
-                moved += pose_step;
-                turned.iter_mut().zip(turn_steps).for_each(|(t, s)| *t += s);
+                let Some(step) = self.step(&mut refined, pass, &moved) else { break };
+                moved.shared += step.shared;
+                moved.own.iter_mut().zip(step.own).for_each(|(m, s)| *m += s);
             }
-            refined.pose = perturb(&refined.pose, &moved);
-            for (total, step) in refined.turns.iter_mut().zip(&turned) {
-                total[0] += step.x;
-                total[1] += step.y;
-            }
+            refined.apply(&moved);
         }
+        refined.strain = self.strain(&refined);
         refined
     }
 
@@ -106,83 +135,105 @@ impl Search<'_> {
                 Some(fine) if pass.fine => fine,
                 _ => &sight.coarse,
             };
-            let turn = refined.turns[view];
-            sites(&mut found, sight, view, level, self.model, &refined.pose, turn, &pass.layout);
+            let state = State {
+                pose: &refined.pose,
+                log_size: refined.log_size,
+                nuisance: refined.nuisances[view],
+            };
+            let up = self.query.up;
+            sites(&mut found, sight, view, level, self.model, &state, up, &pass.layout);
         }
         refined.sites = found;
     }
 
-    /// One Gauss-Newton step from `moved`, `turned`; keeps the information in `refined`.
-    fn step(
-        &self,
-        refined: &mut Refined,
-        pass: &Pass,
-        moved: &Vector6<f64>,
-        turned: &[Vector2<f64>],
-    ) -> Option<(Vector6<f64>, Vec<Vector2<f64>>)> {
+    /// One Gauss-Newton step from `moved`; keeps the covariance in `refined`.
+    fn step(&self, refined: &mut Refined, pass: &Pass, moved: &Move) -> Option<Move> {
         let mut normals = vec![Normal::default(); self.sights.len()];
         for site in &refined.sites {
-            let turn = &turned[site.view];
-            let shift = (site.by_pose * moved).x + (site.by_turn * turn).x;
+            let own = &moved.own[site.view];
+            let shift = (site.by_pose * moved.shared).x + (site.by_nuisance * own).x;
             let Some((weight, residual)) = assign(site, shift, pass.sd_px) else { continue };
             let n = &mut normals[site.view];
-            let (jp, jt) = (site.by_pose.transpose(), site.by_turn.transpose());
-            n.pose += jp * weight * site.by_pose;
-            n.mixed += jp * weight * site.by_turn;
-            n.turn += jt * weight * site.by_turn;
-            n.pose_rhs += jp * (weight * residual);
-            n.turn_rhs += jt * (weight * residual);
+            let (js, jo) = (site.by_pose.transpose(), site.by_nuisance.transpose());
+            n.shared += js * weight * site.by_pose;
+            n.mixed += js * weight * site.by_nuisance;
+            n.own += jo * weight * site.by_nuisance;
+            n.shared_rhs += js * (weight * residual);
+            n.own_rhs += jo * (weight * residual);
         }
-        let (mut a, mut b) = self.prior(&perturb(&refined.pose, moved));
+        let mut now = refined.clone_state();
+        now.apply(moved);
+        let (mut a, mut b) = self.prior(&now);
         let mut eliminated = Vec::with_capacity(normals.len());
         for (view, n) in normals.iter_mut().enumerate() {
-            let sd = self.sights[view].view.turn_sd;
-            a += n.pose;
-            b += n.pose_rhs;
-            let inverse = if sd > 0.0 {
-                let prior = 1.0 / (sd * sd);
-                n.turn += Matrix2::identity() * prior;
-                n.turn_rhs -= (Vector2::from(refined.turns[view]) + turned[view]) * prior;
-                n.turn.try_inverse()
-            } else {
-                None
-            };
-            if let Some(inverse) = inverse {
-                a -= n.mixed * inverse * n.mixed.transpose();
-                b -= n.mixed * inverse * n.turn_rhs;
-            }
+            let precision = self.nuisance_precision(view);
+            n.own += Matrix3::from_diagonal(&precision);
+            n.own_rhs -= precision.component_mul(&now.nuisances[view].0);
+            let inverse = n.own.try_inverse()?;
+            a += n.shared - n.mixed * inverse * n.mixed.transpose();
+            b += n.shared_rhs - n.mixed * inverse * n.own_rhs;
             eliminated.push(inverse);
         }
-        refined.information = a;
-        let step = a.cholesky()?.solve(&b);
-        let turns = normals.iter().zip(eliminated).map(|(n, inverse)| {
-            inverse.map_or(Vector2::zeros(), |i| i * (n.turn_rhs - n.mixed.transpose() * step))
-        });
-        Some((step, turns.collect()))
+        let factor = a.cholesky()?;
+        refined.covariance = factor.inverse().fixed_view::<6, 6>(0, 0).into_owned();
+        let shared = factor.solve(&b);
+        let own = normals.iter().zip(eliminated);
+        let own = own.map(|(n, i)| i * (n.own_rhs - n.mixed.transpose() * shared)).collect();
+        Some(Move { shared, own })
     }
 
-    /// Information and right-hand side of the landmark and of gravity at a pose.
-    fn prior(&self, pose: &Transform) -> (Matrix6<f64>, Vector6<f64>) {
-        let lever = pose.rotation * self.landmark;
-        let residual = self.query.landmark.position.coords - pose.translation.vector - lever;
-        let mut j = Matrix3x6::zeros();
+    fn nuisance_precision(&self, view: usize) -> Vector3<f64> {
+        // An exactly known angle still gets a nanoradian, so that one formula serves.
+        let turn = self.sights[view].view.turn_sd.max(1e-9).powi(-2);
+        Vector3::new(turn, turn, SWELL_SD_PX.powi(-2))
+    }
+
+    /// Residual of the landmark (m) and its derivative by the shared unknowns.
+    fn landmark_residual(&self, state: &Refined) -> (Vector3<f64>, SMatrix<f64, 3, 7>) {
+        let lever = state.pose.rotation * self.landmark * state.log_size.exp();
+        let centre = state.pose.translation.vector;
+        let mut j = SMatrix::<f64, 3, 7>::zeros();
         j.fixed_view_mut::<3, 3>(0, 0).copy_from(&-skew(&lever));
         j.fixed_view_mut::<3, 3>(0, 3).copy_from(&Matrix3::identity());
+        j.fixed_view_mut::<3, 1>(0, 6).copy_from(&lever);
+        (self.query.landmark.position.coords - centre - lever, j)
+    }
+
+    /// Information and right-hand side of the landmark, of gravity and of the size.
+    fn prior(&self, state: &Refined) -> (Matrix7, Vector7) {
+        let (residual, j) = self.landmark_residual(state);
         let weight = self.query.landmark.covariance.try_inverse().unwrap_or_default();
         let (mut a, mut b) = (j.transpose() * weight * j, j.transpose() * weight * residual);
-        if let Some(turn) = self.tilt(pose) {
-            let weight = 1.0 / (STANDING_SD * STANDING_SD);
+        if let Some(turn) = self.tilt(&state.pose) {
             // Only the two turns that tilt the axis are measured, not the one about it.
             let up = self.query.up.map_or(Vector3::z(), |u| u.into_inner());
-            let tilts = (Matrix3::identity() - up * up.transpose()) * weight;
+            let tilts = (Matrix3::identity() - up * up.transpose()) / (STANDING_SD * STANDING_SD);
             let mut block = a.fixed_view_mut::<3, 3>(0, 0);
             block += tilts;
             let mut rhs = b.fixed_rows_mut::<3>(0);
             rhs += tilts * turn;
         }
+        a[(6, 6)] += SIZE_SD.powi(-2);
+        b[6] -= state.log_size * SIZE_SD.powi(-2);
         // A solid of revolution says nothing about one turn: hold it.
-        a += Matrix6::identity() * 1e-3;
+        a += Matrix7::identity() * 1e-3;
         (a, b)
+    }
+
+    /// Half the squared normalised residuals of all priors.
+    fn strain(&self, state: &Refined) -> f64 {
+        let (residual, _) = self.landmark_residual(state);
+        let weight = self.query.landmark.covariance.try_inverse().unwrap_or_default();
+        let landmark = (residual.transpose() * weight * residual).x;
+        let size = (state.log_size / SIZE_SD).powi(2);
+        let tilt = self.tilt(&state.pose).map_or(0.0, |t| (t.norm() / STANDING_SD).powi(2));
+        let own: f64 = (0..state.nuisances.len())
+            .map(|v| {
+                let n = state.nuisances[v].0;
+                n.component_mul(&n).dot(&self.nuisance_precision(v))
+            })
+            .sum();
+        0.5 * (landmark + size + tilt + own)
     }
 
     /// The small turn (base frame) that would make the object stand exactly, when it seems to.
@@ -204,8 +255,24 @@ impl Search<'_> {
     }
 }
 
+impl Refined {
+    fn apply(&mut self, moved: &Move) {
+        self.pose = perturb(&self.pose, &moved.shared.fixed_rows::<6>(0).into_owned());
+        self.log_size += moved.shared[6];
+        for (nuisance, step) in self.nuisances.iter_mut().zip(&moved.own) {
+            nuisance.0 += step;
+        }
+    }
+
+    /// The unknowns without the sites.
+    fn clone_state(&self) -> Self {
+        Refined { sites: Vec::new(), nuisances: self.nuisances.clone(), ..*self }
+    }
+}
+
 /// Weight and mean residual (px) of a site whose contour has moved by `shift`.
 fn assign(site: &Site, shift: f64, sd: f64) -> Option<(f64, f64)> {
+    let sd = deviation(site, sd);
     let missing = absence(site.kind);
     let density = (1.0 - missing) / (sd * (2.0 * std::f64::consts::PI).sqrt());
     let stray = missing * STRAY_DENSITY;

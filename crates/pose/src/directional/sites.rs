@@ -6,7 +6,7 @@
 //! and shadows to feet, so the nearest or the strongest edge is often the wrong one; the refinement
 //! weighs them all.
 
-use nalgebra::{Matrix3, Point3, RowVector2, RowVector6, Vector3};
+use nalgebra::{Matrix3, Point3, RowVector3, SVector, Unit, Vector3};
 use vergence_geometry::{Transform, gaussian::skew};
 
 use super::level::Level;
@@ -29,6 +29,15 @@ pub struct Candidate {
     pub slope: f32,
 }
 
+/// How a site's contour moves across itself by the global unknowns: the pose's tangent (rad, m)
+/// and the logarithm of the object's size.
+pub type ByPose = nalgebra::RowSVector<f64, 7>;
+
+/// What one view's measurements share: small turns of the camera about its own x and y axes (rad),
+/// and how far its silhouettes swell outwards (px; blooming, gamma, rounded edges).
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Nuisance(pub SVector<f64, 3>);
+
 /// A place on the contour.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Site {
@@ -44,10 +53,12 @@ pub struct Site {
     pub normal: (f64, f64),
     /// Contour length that the site stands for (picture px).
     pub length: f64,
-    /// Shift of the contour along the normal by the pose's tangent (px per rad and m).
-    pub by_pose: RowVector6<f64>,
-    /// The same by small turns of the camera about its own x and y axes (px per rad).
-    pub by_turn: RowVector2<f64>,
+    /// The foot of a standing object, where its shadow begins.
+    pub contact: bool,
+    /// Shift of the contour along the normal by the global unknowns (px per unit).
+    pub by_pose: ByPose,
+    /// The same by the view's own unknowns.
+    pub by_nuisance: RowVector3<f64>,
     /// The edges, `count` of them.
     pub candidates: [Candidate; CANDIDATES],
     /// How many edges.
@@ -70,40 +81,62 @@ pub struct Layout {
     pub range_px: f64,
 }
 
-/// Appends the sites of one view; `turn` is the camera's small rotation about its x and y axes.
+/// What the sites are laid out for.
+#[derive(Debug, Clone, Copy)]
+pub struct State<'a> {
+    /// `base_from_object`.
+    pub pose: &'a Transform,
+    /// Logarithm of the object's size against the record's.
+    pub log_size: f64,
+    /// The view's own unknowns.
+    pub nuisance: Nuisance,
+}
+
+/// Appends the sites of one view.
 pub fn sites(
     out: &mut Vec<Site>,
     sight: &Sight,
     view: usize,
     level: &Level,
     model: &Model,
-    pose: &Transform,
-    turn: [f64; 2],
+    state: &State,
+    up: Option<Unit<Vector3<f64>>>,
     layout: &Layout,
 ) {
-    let small_turn = Vector3::new(turn[0], turn[1], 0.0);
-    let turned = Transform::rotation(small_turn);
+    let pose = state.pose;
+    let size = state.log_size.exp();
+    let swell = state.nuisance.0.z;
+    let turned = Transform::rotation(Vector3::new(state.nuisance.0.x, state.nuisance.0.y, 0.0));
     let optical_from_object = turned * sight.optical_from_base * pose;
     let optical_from_base = optical_from_object.rotation * pose.rotation.inverse();
     let optical_from_base: Matrix3<f64> = optical_from_base.to_rotation_matrix().into_inner();
     let eye = optical_from_object.inverse_transform_point(&Point3::origin());
     let mut contour = Contour::new();
-    model.contour(&eye.coords, true, &mut contour);
+    model.contour(&(eye.coords / size), true, &mut contour);
     let camera = &sight.view.camera;
+    let Some(middle) = camera.project(&optical_from_object.translation.vector.into()) else {
+        return;
+    };
+    let up_in_object = up.map(|up| pose.rotation.inverse() * up.into_inner());
     let mut profile = Vec::new();
     for (index, segment) in contour.iter().enumerate() {
-        let [from, to] = [segment.from, segment.to].map(|p| optical_from_object * Point3::from(p));
+        let [from, to] =
+            [segment.from, segment.to].map(|p| optical_from_object * Point3::from(p * size));
         let (Some(a), Some(b)) = (camera.project(&from), camera.project(&to)) else { continue };
         let length = (b - a).norm();
         if length < 0.3 {
             continue;
         }
+        let contact = match (segment.away, up_in_object) {
+            (Some(away), Some(up)) => away.dot(&up) < -CONTACT_COS,
+            _ => false,
+        };
         let n = (length / layout.spacing_px).round().max(1.0) as usize;
         for k in 0..n {
             let share = (k as f64 + 0.5) / n as f64;
             // A point of the 3D segment, and the line's direction in the picture right there:
             // both true under perspective and distortion.
-            let in_object = segment.from.lerp(&segment.to, share);
+            let in_object = segment.from.lerp(&segment.to, share) * size;
             let p = optical_from_object * Point3::from(in_object);
             let Some((pixel, by_point)) = camera.project_with_jacobian(&p) else { continue };
             if !camera.contains(&pixel, 1.0) {
@@ -111,12 +144,23 @@ pub fn sites(
             }
             let along = by_point * (to - from);
             let Some(along) = along.try_normalize(1e-9) else { continue };
-            let normal = nalgebra::RowVector2::new(-along.y, along.x);
+            // The normal points outwards, away from the object's middle.
+            let mut normal = nalgebra::RowVector2::new(-along.y, along.x);
+            if (normal * (pixel - middle)).x < 0.0 {
+                normal = -normal;
+            }
+            let swells = segment.kind == Kind::Silhouette && !contact;
+            let pixel = if swells { pixel + normal.transpose() * swell } else { pixel };
             let across = normal * by_point;
             let by_base = across * optical_from_base;
             let lever = pose.rotation * in_object;
             let by_rotation = by_base * -skew(&lever);
             let by_camera = across * -skew(&p.coords);
+            let mut by_pose = ByPose::zeros();
+            by_pose.fixed_columns_mut::<3>(0).copy_from(&by_rotation);
+            by_pose.fixed_columns_mut::<3>(3).copy_from(&by_base);
+            by_pose[6] = (by_base * lever).x;
+            let by_swell = if swells { 1.0 } else { 0.0 };
             let mut site = Site {
                 view,
                 segment: index,
@@ -124,15 +168,9 @@ pub fn sites(
                 pixel: (pixel.x, pixel.y),
                 normal: (normal.x, normal.y),
                 length: length / n as f64,
-                by_pose: RowVector6::new(
-                    by_rotation.x,
-                    by_rotation.y,
-                    by_rotation.z,
-                    by_base.x,
-                    by_base.y,
-                    by_base.z,
-                ),
-                by_turn: RowVector2::new(by_camera.x, by_camera.y),
+                contact,
+                by_pose,
+                by_nuisance: RowVector3::new(by_camera.x, by_camera.y, by_swell),
                 candidates: Default::default(),
                 count: 0,
             };
@@ -141,6 +179,9 @@ pub fn sites(
         }
     }
 }
+
+/// Cosine above which a face that turns away counts as the one that the object rests on.
+const CONTACT_COS: f64 = 0.99;
 
 /// Local extrema of the slope along the normal, with a parabola through the three samples.
 fn find_edges(site: &mut Site, level: &Level, range_px: f64, profile: &mut Vec<f32>) {

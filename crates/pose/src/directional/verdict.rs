@@ -6,7 +6,7 @@
 //! measured along the very profiles, away from the contour: in print and clutter an edge in the
 //! right place proves little, on a plain table much.
 
-use super::refine::{CORRELATION_PX, absence};
+use super::refine::{CORRELATION_PX, absence, deviation};
 use super::sites::Site;
 use crate::model::Kind;
 
@@ -35,11 +35,12 @@ pub fn weigh(sites: &[Site], range_px: f64, sd_px: f64) -> Explained {
         swept += 2.0 * (range_px - near);
     }
     let density = ((strays + 1.0) / (swept + 10.0)).max(LEAST_DENSITY);
-    let peak = 1.0 / (sd_px * (2.0 * std::f64::consts::PI).sqrt());
     let (mut evidence, mut covered, mut length) = (0.0, 0.0, 0.0);
     let (mut squares, mut belonging) = (0.0, 0.0);
     for site in sites {
         let missing = absence(site.kind);
+        let sd_px = deviation(site, sd_px);
+        let peak = 1.0 / (sd_px * (2.0 * std::f64::consts::PI).sqrt());
         let likelihood: f64 = site
             .edges()
             .iter()
