@@ -36,6 +36,9 @@ pub struct Segment {
     pub to: Vector3<f64>,
     /// What it is.
     pub kind: Kind,
+    /// Outward normal of the face that turns away there, for silhouettes where it is flat: an
+    /// object that rests on that face has a shadow, not a background, on the other side.
+    pub away: Option<Vector3<f64>>,
 }
 
 /// The visible contour: reused between calls so that the search does not allocate.

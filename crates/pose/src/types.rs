@@ -14,6 +14,9 @@ pub struct View<'a> {
     pub camera: Camera,
     /// Pose of the camera's optical frame in the base frame.
     pub base_from_optical: Transform,
+    /// Standard deviation of a small turn of the camera about its own x and y axes (rad): how well
+    /// the head's angles are known. Zero when exactly.
+    pub turn_sd: f64,
 }
 
 impl View<'_> {

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use clap::{Args, ValueEnum};
-use vergence_pose::{ObjectPose, Refusal, paper};
+use vergence_pose::{ObjectPose, Refusal, directional, paper};
 
 use crate::failure::Failure;
 use set::Scene;
@@ -21,7 +21,7 @@ pub struct PoseArgs {
     #[arg(long)]
     out: PathBuf,
     /// How to recognise.
-    #[arg(long, value_enum, default_value_t = Method::Paper)]
+    #[arg(long, value_enum, default_value_t = Method::Directional)]
     method: Method,
     /// Scenes worked on at the same time; the times in the CSV are right only with one.
     #[arg(long, default_value_t = 1)]
@@ -33,6 +33,8 @@ pub struct PoseArgs {
 enum Method {
     /// The 2005 paper's: Canny, box template, distance transform, correlation.
     Paper,
+    /// Directional distance fields, a search over all rotations, refinement, a verdict.
+    Directional,
 }
 
 /// What came of one scene.
@@ -72,6 +74,9 @@ fn recognise(id: u32, folder: &std::path::Path, args: &PoseArgs) -> Result<Outco
     let start = Instant::now();
     let result = match args.method {
         Method::Paper => paper::recognise(&views, &query, &paper::Config::default()),
+        Method::Directional => {
+            directional::recognise(&views, &query, &directional::Config::default())
+        }
     };
     let seconds = start.elapsed().as_secs_f64();
     let base_from_left = views[0].base_from_optical;

@@ -141,12 +141,17 @@ impl Polyhedron {
             if !(a || b) {
                 continue;
             }
-            let kind = if a && b { Kind::Crease } else { Kind::Silhouette };
+            let hidden = edge.faces[usize::from(a)];
+            let (kind, away) = match a && b {
+                true => (Kind::Crease, None),
+                false => (Kind::Silhouette, Some(self.faces[hidden].normal)),
+            };
             let [from, to] = edge.ends.map(|v| self.vertices[v]);
+            let whole = Segment { from, to, kind, away };
             if self.convex {
-                out.push(Segment { from, to, kind });
+                out.push(whole);
             } else {
-                self.visible_pieces(eye, edge, Segment { from, to, kind }, out);
+                self.visible_pieces(eye, edge, whole, out);
             }
         }
     }

@@ -43,6 +43,7 @@ impl Frustum {
                     from: Vector3::new(self.top * cos, self.top * sin, self.half_height),
                     to: Vector3::new(self.bottom * cos, self.bottom * sin, -self.half_height),
                     kind: Kind::Silhouette,
+                    away: None,
                 });
             }
         }
@@ -60,16 +61,28 @@ impl Frustum {
         chords: usize,
         out: &mut Contour,
     ) {
-        let near = if cap { Kind::Crease } else { Kind::Silhouette };
+        let outward = Vector3::new(0.0, 0.0, z.signum());
+        let near = match cap {
+            true => (Kind::Crease, None),
+            false => (Kind::Silhouette, Some(outward)),
+        };
         arc(radius, z, towards - half, 2.0 * half, near, chords, out);
         if cap {
-            let rest = TAU - 2.0 * half;
-            arc(radius, z, towards + half, rest, Kind::Silhouette, chords, out);
+            let far = (Kind::Silhouette, None);
+            arc(radius, z, towards + half, TAU - 2.0 * half, far, chords, out);
         }
     }
 }
 
-fn arc(radius: f64, z: f64, start: f64, length: f64, kind: Kind, chords: usize, out: &mut Contour) {
+fn arc(
+    radius: f64,
+    z: f64,
+    start: f64,
+    length: f64,
+    (kind, away): (Kind, Option<Vector3<f64>>),
+    chords: usize,
+    out: &mut Contour,
+) {
     let n = (length / TAU * chords as f64).ceil() as usize;
     if n == 0 || length < 1e-9 {
         return;
@@ -80,7 +93,7 @@ fn arc(radius: f64, z: f64, start: f64, length: f64, kind: Kind, chords: usize, 
     let mut p = Vector3::new(r * start.cos(), r * start.sin(), z);
     for _ in 0..n {
         let next = Vector3::new(p.x * cos - p.y * sin, p.x * sin + p.y * cos, z);
-        out.push(Segment { from: p, to: next, kind });
+        out.push(Segment { from: p, to: next, kind, away });
         p = next;
     }
 }
@@ -102,7 +115,7 @@ pub fn sphere_outline(radius: f64, eye: &Vector3<f64>, chords: usize, out: &mut 
         axis * height + (u * cos + v * sin) * r
     };
     for k in 0..chords {
-        out.push(Segment { from: at(k), to: at(k + 1), kind: Kind::Silhouette });
+        out.push(Segment { from: at(k), to: at(k + 1), kind: Kind::Silhouette, away: None });
     }
 }
 

@@ -109,6 +109,7 @@ impl Scene {
                 image: &p.image,
                 camera: p.camera,
                 base_from_optical: p.base_from_optical,
+                turn_sd: 0.0,
             })
             .collect()
     }
