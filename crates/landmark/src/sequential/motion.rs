@@ -1,12 +1,18 @@
 //! Registration of the background: how far the picture has moved since the first frame.
 //!
-//! Least squares over the whole picture at half size: two numbers for the motion, and for every row
-//! an offset and a gain of its own, because a lamp under a rolling shutter lights rows differently.
+//! Robust least squares over the whole picture at half size: two numbers for the motion, and for every
+//! row a brightness of its own, because a lamp under a rolling shutter lights rows differently. The
+//! brightness of a row is the median over its pixels; in the fit, pixels that differ far from what the
+//! motion explains (people, things, screens, tags) count nothing (Tukey's biweight).
 
 use vergence_imaging::Image;
 
 /// Independent partial sums: they vectorise, and always add up in the same order.
 const LANES: usize = 8;
+
+/// Residuals (grey levels) at which a pixel counts nothing, pass by pass: wide while the motion is
+/// unknown, then narrow.
+const CUTS: [f32; 3] = [40.0, 16.0, 10.0];
 
 /// Frames that make up the reference picture.
 const REFERENCE_FRAMES: f32 = 8.0;
@@ -53,37 +59,41 @@ impl Reference {
     /// The placement, and what the frame differs by from the reference once it is accounted for.
     fn fit(&self, half: &Image<f32>) -> (Placement, Vec<f32>) {
         let (w, h) = (self.width, half.height());
-        let mut normal = [[0.0f64; 3]; 2];
-        let mut rows: Vec<RowSums> = Vec::with_capacity(h);
-        for y in 0..h {
-            let sums = RowSums::new(&self.picture, half.data(), w, h, y);
-            if y > 0 && y + 1 < h {
-                sums.reduce(&mut normal);
+        let mut ratios = Vec::with_capacity(w);
+        let row_gain: Vec<f32> = (0..h)
+            .map(|y| brightness(&self.picture[y * w..(y + 1) * w], half.row(y), &mut ratios))
+            .collect();
+        let mut slope = [0.0f32; 2];
+        for cut in CUTS {
+            let mut normal = [0.0f64; 5];
+            for y in 1..h - 1 {
+                let rows = [y - 1, y, y + 1].map(|r| &self.picture[r * w..(r + 1) * w]);
+                let sums = accumulate(rows, half.row(y), row_gain[y], slope, cut);
+                reduce(&sums, &mut normal);
             }
-            rows.push(sums);
+            let [xx, xy, yy, xr, yr] = normal;
+            let determinant = xx * yy - xy * xy;
+            // A picture without structure in some direction says nothing about motion along it.
+            if determinant > 1e-3 * xx * yy && xx > 1.0 && yy > 1.0 {
+                slope[0] += ((yy * xr - xy * yr) / determinant) as f32;
+                slope[1] += ((xx * yr - xy * xr) / determinant) as f32;
+            }
         }
-        let [[xx, xy, xr], [_, yy, yr]] = normal;
-        let determinant = xx * yy - xy * xy;
-        // A picture without structure in some direction says nothing about motion along it.
-        let solvable = determinant > 1e-3 * xx * yy && xx > 1.0 && yy > 1.0;
-        let (a, b) = if solvable {
-            ((yy * xr - xy * yr) / determinant, (xx * yr - xy * xr) / determinant)
-        } else {
-            (0.0, 0.0)
-        };
-        let gain = rows.iter().map(|row| row.gain(a, b)).collect();
-        let mut change = vec![0.0; if self.frames < REFERENCE_FRAMES { w * h } else { 0 }];
-        if !change.is_empty() {
+        let mut change = Vec::new();
+        if self.frames < REFERENCE_FRAMES {
+            change = vec![0.0; w * h];
             for y in 1..h - 1 {
                 for x in 1..w - 1 {
                     let (gx, gy) = slopes(&self.picture, w, x, y);
                     let i = y * w + x;
-                    change[i] = half.data()[i] - self.picture[i] - a as f32 * gx - b as f32 * gy;
+                    let moved = self.picture[i] + slope[0] * gx + slope[1] * gy;
+                    change[i] = half.data()[i] - row_gain[y] * moved;
                 }
             }
         }
         // The content moved by d: I(x) = B(x - d), so the slope's factor is -d, at half size.
-        (Placement { dx: -2.0 * a, dy: -2.0 * b, row_gain: gain }, change)
+        let [dx, dy] = slope.map(|s| -2.0 * f64::from(s));
+        (Placement { dx, dy, row_gain }, change)
     }
 }
 
@@ -93,63 +103,32 @@ fn slopes(picture: &[f32], width: usize, x: usize, y: usize) -> (f32, f32) {
     (0.5 * (picture[i + 1] - picture[i - 1]), 0.5 * (picture[i + width] - picture[i - width]))
 }
 
-/// Products of the regressors of one row: 1, brightness, slope x, slope y, and the residual.
-#[derive(Debug, Clone, Copy, Default)]
-struct RowSums {
-    sum: [f32; 5],
-    product: [[f32; 5]; 5],
+/// Brightness of a row relative to the reference: median of the ratios of its brighter pixels.
+fn brightness(reference: &[f32], row: &[f32], ratios: &mut Vec<f32>) -> f32 {
+    let step = (row.len() / 80).max(1);
+    ratios.clear();
+    let pairs = reference.iter().zip(row).step_by(step);
+    ratios.extend(pairs.filter(|(r, _)| **r > 16.0).map(|(r, v)| v / r));
+    if ratios.len() < 8 {
+        return 1.0;
+    }
+    let middle = ratios.len() / 2;
+    *ratios.select_nth_unstable_by(middle, f32::total_cmp).1
 }
 
-impl RowSums {
-    fn new(reference: &[f32], frame: &[f32], w: usize, h: usize, y: usize) -> Self {
-        let mut sums = RowSums::default();
-        if y == 0 || y + 1 >= h {
-            return sums;
-        }
-        let row = y * w;
-        let (here, above, below) =
-            (&reference[row..row + w], &reference[row - w..row], &reference[row + w..row + 2 * w]);
-        let frame = &frame[row..row + w];
-        let lane = accumulate(here, above, below, frame);
-        let [b, x, yy, r, bb, bx, by, br, xx, xy, xr, yyy, yr] = lane;
-        let n = (w.saturating_sub(2) / LANES * LANES) as f32;
-        sums.sum = [n, b, x, yy, r];
-        sums.product[1] = [0.0, bb, bx, by, br];
-        sums.product[2] = [0.0, bx, xx, xy, xr];
-        sums.product[3] = [0.0, by, xy, yyy, yr];
-        sums
-    }
-
-    /// A product of two regressors with the row's mean taken out.
-    fn centred(&self, i: usize, j: usize) -> f64 {
-        let (si, sj) = (f64::from(self.sum[i]), f64::from(self.sum[j]));
-        f64::from(self.product[i][j]) - si * sj / f64::from(self.sum[0].max(1.0))
-    }
-
-    /// Adds this row to the normal equations of the motion, its own offset and gain eliminated.
-    fn reduce(&self, normal: &mut [[f64; 3]; 2]) {
-        let brightness = self.centred(1, 1).max(1.0);
-        for (i, equation) in normal.iter_mut().enumerate() {
-            for (j, entry) in equation.iter_mut().enumerate() {
-                let (p, q) = (i + 2, j + 2);
-                *entry += self.centred(p, q) - self.centred(1, p) * self.centred(1, q) / brightness;
-            }
-        }
-    }
-
-    /// Brightness of the row relative to the reference's, the motion accounted for.
-    fn gain(&self, a: f64, b: f64) -> f32 {
-        let change =
-            f64::from(self.sum[4]) - a * f64::from(self.sum[2]) - b * f64::from(self.sum[3]);
-        (1.0 + change / f64::from(self.sum[1].max(1.0))) as f32
-    }
-}
-
+/// Weighted sums over one row: weight; slope x, slope y, residual; products xx, xy, yy, xr, yr.
 #[multiversion::multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
-fn accumulate(here: &[f32], above: &[f32], below: &[f32], frame: &[f32]) -> [f32; 13] {
+fn accumulate(
+    [above, here, below]: [&[f32]; 3],
+    frame: &[f32],
+    gain: f32,
+    slope: [f32; 2],
+    cut: f32,
+) -> [f32; 9] {
     let n = here.len();
     let (above, below, frame) = (&above[..n], &below[..n], &frame[..n]);
-    let mut lanes = [[0.0f32; LANES]; 13];
+    let scale = 1.0 / (cut * cut);
+    let mut lanes = [[0.0f32; LANES]; 9];
     let mut x = 1;
     while x + LANES < n {
         let (left, right) = (&here[x - 1..x - 1 + LANES], &here[x + 1..x + 1 + LANES]);
@@ -157,24 +136,36 @@ fn accumulate(here: &[f32], above: &[f32], below: &[f32], frame: &[f32]) -> [f32
         let f = &frame[x..x + LANES];
         for k in 0..LANES {
             let (gx, gy) = (0.5 * (right[k] - left[k]), 0.5 * (down[k] - up[k]));
-            let (v, r) = (b[k], f[k] - b[k]);
-            lanes[0][k] += v;
-            lanes[1][k] += gx;
-            lanes[2][k] += gy;
-            lanes[3][k] += r;
-            lanes[4][k] += v * v;
-            lanes[5][k] += v * gx;
-            lanes[6][k] += v * gy;
-            lanes[7][k] += v * r;
-            lanes[8][k] += gx * gx;
-            lanes[9][k] += gx * gy;
-            lanes[10][k] += gx * r;
-            lanes[11][k] += gy * gy;
-            lanes[12][k] += gy * r;
+            let r = f[k] - gain * (b[k] + slope[0] * gx + slope[1] * gy);
+            let near = (1.0 - r * r * scale).max(0.0);
+            let weight = near * near;
+            let (wx, wy) = (weight * gx, weight * gy);
+            lanes[0][k] += weight;
+            lanes[1][k] += wx;
+            lanes[2][k] += wy;
+            lanes[3][k] += weight * r;
+            lanes[4][k] += wx * gx;
+            lanes[5][k] += wx * gy;
+            lanes[6][k] += wy * gy;
+            lanes[7][k] += wx * r;
+            lanes[8][k] += wy * r;
         }
         x += LANES;
     }
     lanes.map(|lane| lane.iter().sum())
+}
+
+/// Adds a row to the normal equations (xx, xy, yy, xr, yr), its own offset eliminated.
+fn reduce(sums: &[f32; 9], normal: &mut [f64; 5]) {
+    let [weight, x, y, r, xx, xy, yy, xr, yr] = sums.map(f64::from);
+    if weight < 8.0 {
+        return;
+    }
+    let centred = [xx - x * x / weight, xy - x * y / weight, yy - y * y / weight];
+    let right = [xr - x * r / weight, yr - y * r / weight];
+    for (n, c) in normal.iter_mut().zip(centred.into_iter().chain(right)) {
+        *n += c;
+    }
 }
 
 /// The picture at half size: means of 2x2 pixels.

@@ -11,7 +11,7 @@ use super::history::History;
 const STILL_PX: f64 = 0.02;
 
 /// A lamp shows in at least this share of the rows, or it is no lamp.
-const LAMP_SPREAD: f64 = 0.3;
+const LAMP_SPREAD: f64 = 0.5;
 
 /// Lamps below this change of the rows' brightness (relative, rms) drown in the noise of a pixel.
 const LAMP_FLOOR: f64 = 1e-3;
