@@ -7,6 +7,7 @@ use vergence_imaging::Image;
 
 use super::front::GAIN;
 use super::motion::Placement;
+use super::shift::weights;
 
 /// One frame of the past.
 #[derive(Debug, Clone)]
@@ -17,7 +18,7 @@ pub struct Past {
     pub exposure: f64,
     /// Where the picture lay.
     pub placement: Placement,
-    /// The filtered picture.
+    /// The filtered picture, moved back to where the first frame lay.
     pub filtered: Image<i16>,
 }
 
@@ -73,14 +74,17 @@ impl History {
         (self.frames.iter().map(|p| square(&p.placement)).sum::<f64>() / n).sqrt()
     }
 
-    /// Brightness over time (grey levels of a light there) at a place of the first frame, followed
-    /// as the picture moves.
+    /// Brightness over time (grey levels of a light there) at a place of the first frame.
     pub fn series(&self, place: Point2<f64>, out: &mut Vec<f32>) {
         out.clear();
-        for past in &self.frames {
-            let (x, y) = (place.x + past.placement.dx, place.y + past.placement.dy);
-            out.push(cubic(&past.filtered, x, y) / GAIN);
-        }
+        out.extend(self.frames.iter().map(|p| cubic(&p.filtered, place.x, place.y) / GAIN));
+    }
+
+    /// The same on a pixel.
+    pub fn series_at(&self, (x, y): (usize, usize), out: &mut Vec<f32>) {
+        out.clear();
+        let scale = 1.0 / GAIN;
+        out.extend(self.frames.iter().map(|p| f32::from(p.filtered.row(y)[x]) * scale));
     }
 }
 
@@ -100,14 +104,4 @@ fn cubic(image: &Image<i16>, x: f64, y: f64) -> f32 {
         sum += wy * line;
     }
     sum
-}
-
-fn weights(t: f32) -> [f32; 4] {
-    let (t2, t3) = (t * t, t * t * t);
-    [
-        0.5 * (-t3 + 2.0 * t2 - t),
-        0.5 * (3.0 * t3 - 5.0 * t2 + 2.0),
-        0.5 * (-3.0 * t3 + 4.0 * t2 + t),
-        0.5 * (t3 - t2),
-    ]
 }

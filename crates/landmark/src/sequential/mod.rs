@@ -23,20 +23,21 @@ pub mod history;
 pub mod motion;
 pub mod nuisance;
 pub mod scan;
+pub mod shift;
 pub mod template;
 mod verdict;
 
 use std::time::Duration;
 
-use vergence_imaging::Frame;
+use vergence_imaging::{Frame, Image};
 use vergence_tag::Pattern;
 
 use crate::finder::{Sequence, check_requests};
 use crate::{Decision, Finder, FinderError, Request};
 use front::Variation;
 use history::{History, Past};
-use motion::Reference;
-use nuisance::Nuisance;
+use motion::{Placement, Reference};
+use nuisance::{Nuisance, STILL_PX};
 use scan::{BlockNoise, Candidate};
 use verdict::Round;
 
@@ -156,12 +157,20 @@ impl SequentialFinder {
     }
 }
 
+/// The filtered frame, moved back to where the first frame lay.
+fn still(filtered: Image<i16>, placement: &Placement) -> Image<i16> {
+    if placement.dx.hypot(placement.dy) < STILL_PX {
+        return filtered;
+    }
+    shift::shifted(&filtered, placement.dx, placement.dy).map(|v| v.round() as i16)
+}
+
 impl Finder for SequentialFinder {
     fn push(&mut self, frame: &Frame) -> Result<(), FinderError> {
         let time = self.sequence.accept(frame)?;
         self.size = (frame.image.width(), frame.image.height());
         let placement = self.reference.place(&frame.image);
-        let filtered = front::filter(&frame.image);
+        let filtered = still(front::filter(&frame.image), &placement);
         let pixels = self.size.0 * self.size.1;
         let window = self.config.window_frames;
         let variation = self.variation.get_or_insert_with(|| Variation::new(pixels, window));

@@ -7,12 +7,17 @@
 
 use vergence_imaging::Image;
 
+use super::shift::shifted;
+
 /// Independent partial sums: they vectorise, and always add up in the same order.
 const LANES: usize = 8;
 
 /// Residuals (grey levels) at which a pixel counts nothing, pass by pass: wide while the motion is
 /// unknown, then narrow.
-const CUTS: [f32; 3] = [40.0, 16.0, 10.0];
+const CUTS: [f32; 4] = [40.0, 20.0, 10.0, 10.0];
+
+/// Largest shift that is followed (px of the half-size picture): sway, not a moving head.
+const MOST_PX: f64 = 8.0;
 
 /// Frames that make up the reference picture.
 const REFERENCE_FRAMES: f32 = 8.0;
@@ -20,9 +25,9 @@ const REFERENCE_FRAMES: f32 = 8.0;
 /// The picture against which frames are registered.
 #[derive(Debug, Clone, Default)]
 pub struct Reference {
-    picture: Vec<f32>,
-    width: usize,
+    picture: Option<Image<f32>>,
     frames: f32,
+    last: (f64, f64),
 }
 
 /// How one frame lies against the reference.
@@ -40,67 +45,53 @@ impl Reference {
     /// Registers a frame and, while the reference is young, adds it.
     pub fn place(&mut self, image: &Image<u8>) -> Placement {
         let half = half_size(image);
-        if self.frames == 0.0 {
-            self.width = half.width();
-            self.picture = half.data().to_vec();
+        let Some(reference) = &mut self.picture else {
+            let row_gain = vec![1.0; half.height()];
+            self.picture = Some(half);
             self.frames = 1.0;
-            return Placement { row_gain: vec![1.0; half.height()], ..Placement::default() };
-        }
-        let (placement, change) = self.fit(&half);
+            return Placement { row_gain, ..Placement::default() };
+        };
+        let placement = fit(reference, &half, self.last);
+        self.last = (placement.dx, placement.dy);
         if self.frames < REFERENCE_FRAMES {
             self.frames += 1.0;
-            for (p, c) in self.picture.iter_mut().zip(change) {
-                *p += c / self.frames;
+            let back = shifted(&half, 0.5 * placement.dx, 0.5 * placement.dy);
+            for (y, gain) in placement.row_gain.iter().enumerate() {
+                for (r, v) in reference.row_mut(y).iter_mut().zip(back.row(y)) {
+                    *r += (v / gain.max(0.1) - *r) / self.frames;
+                }
             }
         }
         placement
     }
-
-    /// The placement, and what the frame differs by from the reference once it is accounted for.
-    fn fit(&self, half: &Image<f32>) -> (Placement, Vec<f32>) {
-        let (w, h) = (self.width, half.height());
-        let mut ratios = Vec::with_capacity(w);
-        let row_gain: Vec<f32> = (0..h)
-            .map(|y| brightness(&self.picture[y * w..(y + 1) * w], half.row(y), &mut ratios))
-            .collect();
-        let mut slope = [0.0f32; 2];
-        for cut in CUTS {
-            let mut normal = [0.0f64; 5];
-            for y in 1..h - 1 {
-                let rows = [y - 1, y, y + 1].map(|r| &self.picture[r * w..(r + 1) * w]);
-                let sums = accumulate(rows, half.row(y), row_gain[y], slope, cut);
-                reduce(&sums, &mut normal);
-            }
-            let [xx, xy, yy, xr, yr] = normal;
-            let determinant = xx * yy - xy * xy;
-            // A picture without structure in some direction says nothing about motion along it.
-            if determinant > 1e-3 * xx * yy && xx > 1.0 && yy > 1.0 {
-                slope[0] += ((yy * xr - xy * yr) / determinant) as f32;
-                slope[1] += ((xx * yr - xy * xr) / determinant) as f32;
-            }
-        }
-        let mut change = Vec::new();
-        if self.frames < REFERENCE_FRAMES {
-            change = vec![0.0; w * h];
-            for y in 1..h - 1 {
-                for x in 1..w - 1 {
-                    let (gx, gy) = slopes(&self.picture, w, x, y);
-                    let i = y * w + x;
-                    let moved = self.picture[i] + slope[0] * gx + slope[1] * gy;
-                    change[i] = half.data()[i] - row_gain[y] * moved;
-                }
-            }
-        }
-        // The content moved by d: I(x) = B(x - d), so the slope's factor is -d, at half size.
-        let [dx, dy] = slope.map(|s| -2.0 * f64::from(s));
-        (Placement { dx, dy, row_gain }, change)
-    }
 }
 
-/// Derivatives of a picture along x and y (grey levels per pixel).
-fn slopes(picture: &[f32], width: usize, x: usize, y: usize) -> (f32, f32) {
-    let i = y * width + x;
-    (0.5 * (picture[i + 1] - picture[i - 1]), 0.5 * (picture[i + width] - picture[i - width]))
+/// Least squares by Gauss-Newton from a first guess of the shift (px of the full picture).
+fn fit(reference: &Image<f32>, half: &Image<f32>, guess: (f64, f64)) -> Placement {
+    let (w, h) = (half.width(), half.height());
+    let mut ratios = Vec::with_capacity(w);
+    let row_gain: Vec<f32> =
+        (0..h).map(|y| brightness(reference.row(y), half.row(y), &mut ratios)).collect();
+    let (mut dx, mut dy) = (0.5 * guess.0, 0.5 * guess.1);
+    for cut in CUTS {
+        // The content moved by d: the frame shows at x what the reference shows at x - d.
+        let moved = shifted(reference, -dx, -dy);
+        let mut normal = [0.0f64; 5];
+        for y in 1..h - 1 {
+            let rows = [moved.row(y - 1), moved.row(y), moved.row(y + 1)];
+            reduce(&accumulate(rows, half.row(y), row_gain[y], cut), &mut normal);
+        }
+        let [xx, xy, yy, xr, yr] = normal;
+        let determinant = xx * yy - xy * xy;
+        // A picture without structure in some direction says nothing about motion along it.
+        if determinant <= 1e-3 * xx * yy || xx <= 1.0 || yy <= 1.0 {
+            continue;
+        }
+        let step = ((yy * xr - xy * yr) / determinant, (xx * yr - xy * xr) / determinant);
+        dx = (dx - step.0.clamp(-1.5, 1.5)).clamp(-MOST_PX, MOST_PX);
+        dy = (dy - step.1.clamp(-1.5, 1.5)).clamp(-MOST_PX, MOST_PX);
+    }
+    Placement { dx: 2.0 * dx, dy: 2.0 * dy, row_gain }
 }
 
 /// Brightness of a row relative to the reference: median of the ratios of its brighter pixels.
@@ -118,13 +109,7 @@ fn brightness(reference: &[f32], row: &[f32], ratios: &mut Vec<f32>) -> f32 {
 
 /// Weighted sums over one row: weight; slope x, slope y, residual; products xx, xy, yy, xr, yr.
 #[multiversion::multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
-fn accumulate(
-    [above, here, below]: [&[f32]; 3],
-    frame: &[f32],
-    gain: f32,
-    slope: [f32; 2],
-    cut: f32,
-) -> [f32; 9] {
+fn accumulate([above, here, below]: [&[f32]; 3], frame: &[f32], gain: f32, cut: f32) -> [f32; 9] {
     let n = here.len();
     let (above, below, frame) = (&above[..n], &below[..n], &frame[..n]);
     let scale = 1.0 / (cut * cut);
@@ -136,7 +121,7 @@ fn accumulate(
         let f = &frame[x..x + LANES];
         for k in 0..LANES {
             let (gx, gy) = (0.5 * (right[k] - left[k]), 0.5 * (down[k] - up[k]));
-            let r = f[k] - gain * (b[k] + slope[0] * gx + slope[1] * gy);
+            let r = f[k] - gain * b[k];
             let near = (1.0 - r * r * scale).max(0.0);
             let weight = near * near;
             let (wx, wy) = (weight * gx, weight * gy);

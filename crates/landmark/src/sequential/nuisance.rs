@@ -8,7 +8,7 @@
 use super::history::History;
 
 /// Shake below this (px rms) is the noise of the registration, not motion.
-const STILL_PX: f64 = 0.02;
+pub const STILL_PX: f64 = 0.02;
 
 /// A lamp shows in at least this share of the rows, or it is no lamp.
 const LAMP_SPREAD: f64 = 0.5;

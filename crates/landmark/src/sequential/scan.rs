@@ -5,7 +5,6 @@
 //! of each block that varies most is tested for every pattern's lines; the best few places a pattern
 //! go on. Choosing by rank, not by a threshold, keeps the cost constant and needs no noise model.
 
-use nalgebra::Point2;
 use vergence_tag::Pattern;
 
 use super::front::{GAIN, NOISE_GAIN};
@@ -158,7 +157,7 @@ pub fn by_lines(
     let mut best: Vec<Vec<(f32, (usize, usize))>> = vec![Vec::new(); patterns.len()];
     let mut series = Vec::with_capacity(times.len());
     for (x, y) in varying(energy, width, height) {
-        history.series(Point2::new(x as f64, y as f64), &mut series);
+        history.series_at((x, y), &mut series);
         nuisance.remove(&mut series);
         let total = dot(&series, &series) + 40.0 * noise.at(x, y) as f32;
         for (request, set) in sets.iter().enumerate().filter(|(_, set)| !set.is_empty()) {

@@ -117,7 +117,7 @@ impl Round<'_> {
         for candidate in candidates {
             let (x, y) = candidate.pixel;
             let place = Point2::new(x as f64, y as f64);
-            self.history.series(place, &mut raw);
+            self.history.series_at(candidate.pixel, &mut raw);
             let series = Series::new(&raw, self.nuisance, self.noise.at(x, y));
             let range = candidate.request.map_or(0..self.requests.len(), |r| r..r + 1);
             for request in range {
