@@ -102,4 +102,8 @@ impl PanTilt for SimPanTilt {
     fn resolution(&self) -> f64 {
         lock(&self.world).heads[self.side as usize].servos[0].resolution()
     }
+
+    fn backlash(&self) -> f64 {
+        lock(&self.world).heads[self.side as usize].servos[0].backlash()
+    }
 }

@@ -278,10 +278,12 @@ impl Run<'_> {
     ) -> Result<ObjectPose, Stop> {
         let poses: [Transform; 2] =
             std::array::from_fn(|k| self.system.heads[k].base_from_optical(angles[k]));
+        let noise = self.noise();
         let views: [View<'_>; 2] = std::array::from_fn(|k| View {
             image: &frames[k].image,
             camera: self.system.heads[k].camera,
             base_from_optical: poses[k],
+            turn_sd: noise.step_sigma.hypot(noise.common_sigma),
         });
         let query = Query {
             record,
@@ -293,7 +295,7 @@ impl Run<'_> {
         let outcome = match self.config.method {
             Method::Paper => vergence_pose::paper::recognise(&views, &query, &Default::default()),
             Method::Directional => {
-                vergence_pose::paper::recognise(&views, &query, &Default::default())
+                vergence_pose::directional::recognise(&views, &query, &Default::default())
             }
         };
         self.observer.notice(&Event::Recognised(&views, &query, outcome.as_ref()));

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use vergence_devices::{JointReading, LedCommand, Side, TagAddress};
 use vergence_landmark::paper::PaperFinder;
+use vergence_landmark::sequential::SequentialFinder;
 use vergence_landmark::{Decision, Finder, FinderError, Request, Sighting};
 use vergence_tag::Pattern;
 use vergence_tag::pattern::Bits;
@@ -27,7 +28,7 @@ impl Run<'_> {
         let interval = self.frame_interval()?;
         let (bits, chip) = match self.config.method {
             Method::Paper => (Bits::FLICKER, interval * FLICKER_FRAMES),
-            Method::Directional => (Bits::FLICKER, interval * FLICKER_FRAMES),
+            Method::Directional => ("110100100101".parse().unwrap_or(Bits::FLICKER), interval),
         };
         let pattern = Pattern::new(bits, chip).map_err(|_| rate_fault(interval))?;
         self.command(tag, LedCommand::Play(pattern))?;
@@ -85,7 +86,7 @@ impl Run<'_> {
         }];
         Ok(match self.config.method {
             Method::Paper => Box::new(PaperFinder::new(requests, Default::default())?),
-            Method::Directional => Box::new(PaperFinder::new(requests, Default::default())?),
+            Method::Directional => Box::new(SequentialFinder::new(requests, Default::default())?),
         })
     }
 }

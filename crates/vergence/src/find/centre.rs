@@ -116,7 +116,7 @@ impl Run<'_> {
     }
 
     /// Angle noise of the coarser head.
-    fn noise(&self) -> Noise {
+    pub(super) fn noise(&self) -> Noise {
         let servos = self.system.robot.heads.iter().map(|head| &head.pan_tilt);
         servos.fold(Noise { step_sigma: 0.0, common_sigma: 0.0 }, |noise, servo| {
             let of_servo = Noise::of_servo(servo.resolution(), servo.backlash());
