@@ -104,6 +104,9 @@ pub trait Finder {
     /// Takes the next frame; frames come in order of their stamps, gaps are allowed.
     fn push(&mut self, frame: &Frame) -> Result<(), FinderError>;
 
+    /// Says that no more frames come: a last decision with what there is.
+    fn finish(&mut self) {}
+
     /// What is known so far, one decision a request and in their order.
     fn decisions(&self) -> &[Decision];
 
@@ -148,6 +151,11 @@ pub(crate) struct Sequence {
 impl Sequence {
     /// Side of the smallest picture that is accepted (px).
     const MIN_SIDE: usize = 16;
+
+    /// Stamp of the newest frame.
+    pub fn last_stamp(&self) -> Option<Duration> {
+        self.last
+    }
 
     /// Accepts a frame and returns its time since the first frame (s).
     pub fn accept(&mut self, frame: &Frame) -> Result<f64, FinderError> {

@@ -11,5 +11,6 @@
 
 mod finder;
 pub mod paper;
+pub mod sequential;
 
 pub use finder::{Decision, Finder, FinderError, Request, Sighting};

@@ -177,8 +177,7 @@ mod tests {
         writer.number(1.5f64.to_le_bytes());
         let bytes = writer.finish();
         // Worked by hand: byte, 3 padding, u32, count 3 with "ab\0", 1 padding up to 16, f64.
-        let mut expected = vec![0, 1, 0, 0, 7, 0, 0, 0, 4, 3, 2, 1, 3, 0, 0, 0, b'a', b'b', 0];
-        expected.extend([0, 0, 0, 0, 0]);
+        let mut expected = vec![0, 1, 0, 0, 7, 0, 0, 0, 4, 3, 2, 1, 3, 0, 0, 0, b'a', b'b', 0, 0];
         expected.extend(1.5f64.to_le_bytes());
         assert_eq!(bytes, expected);
     }

@@ -106,6 +106,11 @@ impl Servo {
         self.load
     }
 
+    /// Dead band (rad).
+    pub fn backlash(&self) -> f64 {
+        self.backlash
+    }
+
     /// Encoder step (rad).
     pub fn resolution(&self) -> f64 {
         self.resolution

@@ -109,6 +109,12 @@ pub enum RecordingError {
         /// How many coefficients it has.
         count: usize,
     },
+    /// The camera's numbers are for a larger picture than the one that is recorded.
+    #[error("\"{topic}\": binning and regions of interest are not read; record whole pictures")]
+    Part {
+        /// Which topic.
+        topic: String,
+    },
     /// A topic was written with two different types.
     #[error("\"{topic}\" already carries {first}; {second} cannot be written to it")]
     TwoTypes {

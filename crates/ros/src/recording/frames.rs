@@ -12,7 +12,7 @@ use super::pixels;
 use super::reader::{Messages, OfTopic, decode, type_of};
 use super::stream::Raw;
 use crate::message::Message;
-use crate::msg::sensor_msgs::{CameraInfo, CompressedImage};
+use crate::msg::sensor_msgs::{CameraInfo, CompressedImage, RegionOfInterest};
 use crate::msg::std_msgs::Header;
 use crate::msg::{builtin_interfaces::Time, sensor_msgs};
 
@@ -35,8 +35,8 @@ pub struct Frames {
 /// in order, one that comes later than that or repeats a stamp is left out. `sequence` is the
 /// running number on the topic, `row_time` unknown.
 ///
-/// A picture that cannot be decoded is an error, after which the next one follows; a damaged file
-/// ends the iteration.
+/// A picture or a chunk that cannot be decoded is an error, after which the next one follows;
+/// damage to the file's framing ends the iteration.
 pub fn frames(path: &Path, topic: &str, exposure: Duration) -> Result<Frames, RecordingError> {
     Ok(Frames {
         raw: OfTopic::open(path, topic)?,
@@ -122,10 +122,21 @@ fn camera(info: &CameraInfo, topic: &str) -> Result<Camera, RecordingError> {
         model: info.distortion_model.clone(),
         count: info.d.len(),
     };
+    let none = |d: &[f64]| d.iter().all(|value| *value == 0.0);
+    let (roi, whole) = (&info.roi, RegionOfInterest::default());
+    let full = RegionOfInterest { width: info.width, height: info.height, ..whole };
+    if info.binning_x > 1 || info.binning_y > 1 || (*roi != whole && *roi != full) {
+        return Err(RecordingError::Part { topic: topic.into() });
+    }
     let distortion = match (info.distortion_model.as_str(), info.d.as_slice()) {
-        (_, d) if d.iter().all(|value| *value == 0.0) => Distortion::default(),
+        ("plumb_bob" | "rational_polynomial" | "", d) if none(d) => Distortion::default(),
         ("plumb_bob" | "", &[k1, k2, p1, p2]) => Distortion { k1, k2, p1, p2, k3: 0.0 },
-        ("plumb_bob" | "", &[k1, k2, p1, p2, k3]) => Distortion { k1, k2, p1, p2, k3 },
+        // The rational model is the same as long as its further numbers are zero.
+        ("plumb_bob" | "rational_polynomial" | "", &[k1, k2, p1, p2, k3, ref more @ ..])
+            if none(more) =>
+        {
+            Distortion { k1, k2, p1, p2, k3 }
+        }
         _ => return Err(lens()),
     };
     let [fx, _, cx, _, fy, cy, ..] = info.k;
@@ -133,4 +144,43 @@ fn camera(info: &CameraInfo, topic: &str) -> Result<Camera, RecordingError> {
     let camera = Camera { width, height, fx, fy, cx, cy, distortion };
     camera.validate().map_err(|source| RecordingError::Camera { topic: topic.into(), source })?;
     Ok(camera)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::convert;
+
+    fn info(model: &str, d: &[f64]) -> CameraInfo {
+        let info = convert::camera_info(&Camera::centred(320, 240, 300.0), Duration::ZERO, "eye");
+        CameraInfo { distortion_model: model.into(), d: d.into(), ..info }
+    }
+
+    #[test]
+    fn lens_models_that_are_the_same_are_read_and_others_refused() {
+        let rational = [0.1, 0.2, 0.3, 0.4, 0.5, 0.0, 0.0, 0.0];
+        let camera_of = |info: CameraInfo| camera(&info, "/info");
+        let expected = Distortion { k1: 0.1, k2: 0.2, p1: 0.3, p2: 0.4, k3: 0.5 };
+        assert_eq!(camera_of(info("plumb_bob", &rational[..5])).unwrap().distortion, expected);
+        assert_eq!(camera_of(info("rational_polynomial", &rational)).unwrap().distortion, expected);
+        assert!(camera_of(info("", &[])).unwrap().distortion.is_none());
+        let refused = |info| camera_of(info).unwrap_err().to_string();
+        // Even without coefficients this is no pinhole camera.
+        let fisheye = refused(info("equidistant", &[0.0; 4]));
+        assert!(fisheye.contains("\"equidistant\" with 4 numbers"), "{fisheye}");
+        let full_rational = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.0, 0.0];
+        assert!(refused(info("rational_polynomial", &full_rational)).contains("8 numbers"));
+    }
+
+    #[test]
+    fn numbers_that_cannot_be_and_parts_of_a_picture_are_refused() {
+        let refused = |info: CameraInfo| camera(&info, "/info").unwrap_err();
+        let uncalibrated = CameraInfo { k: [0.0; 9], ..info("plumb_bob", &[]) };
+        assert!(refused(uncalibrated).to_string().contains("fx"));
+        let binned = CameraInfo { binning_x: 2, ..info("plumb_bob", &[]) };
+        assert!(matches!(refused(binned), RecordingError::Part { .. }));
+        let roi = RegionOfInterest { x_offset: 8, width: 64, height: 48, ..Default::default() };
+        let cropped = CameraInfo { roi, ..info("plumb_bob", &[]) };
+        assert!(matches!(refused(cropped), RecordingError::Part { .. }));
+    }
 }

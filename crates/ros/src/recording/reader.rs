@@ -41,7 +41,7 @@ pub struct Recorded<M> {
 
 impl Reader {
     /// Reads the file once from start to end to count its messages, in memory that does not grow
-    /// with the file.
+    /// with the file. Any damage but a missing end is an error.
     pub fn open(path: &Path) -> Result<Self, RecordingError> {
         let mut stream = Stream::open(path)?;
         let mut topics: BTreeMap<String, Topic> = BTreeMap::new();
@@ -80,8 +80,8 @@ impl Reader {
 
 /// Messages of one topic and type in the order of recording.
 ///
-/// An error ends the iteration only when the file itself is damaged; after a message that does not
-/// decode the next one follows.
+/// After a message or a chunk that does not decode the next one follows; damage to the file's framing
+/// ends the iteration.
 pub struct Messages<M> {
     raw: OfTopic,
     message: PhantomData<M>,

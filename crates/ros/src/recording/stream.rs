@@ -9,12 +9,12 @@ use std::sync::Arc;
 use mcap::read::ChannelAccumulator;
 use mcap::records::{Record, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
-use mcap::{Channel, McapError, parse_record};
+use mcap::{Channel, McapError, McapResult, parse_record};
 
-use super::chunk;
+use super::chunk::Chunk;
 use super::error::RecordingError;
 
-/// Largest record and largest compressed chunk that is read (bytes): a bound on memory.
+/// Largest record and largest chunk, packed or not, that is read (bytes): a bound on memory.
 const LARGEST_RECORD: usize = 128 << 20;
 /// Most bytes read at once; a record that claims more than the file holds costs no more than this.
 const READ_AT_ONCE: usize = 1 << 20;
@@ -34,6 +34,7 @@ pub(super) struct Stream {
     path: PathBuf,
     file: File,
     reader: LinearReader,
+    chunk: Chunk,
     channels: ChannelAccumulator<'static>,
     end: Option<End>,
 }
@@ -55,17 +56,12 @@ impl Stream {
             .map_err(|source| RecordingError::File { path: path.into(), source })?;
         let options = LinearReaderOptions::default()
             .with_record_length_limit(LARGEST_RECORD)
-            .with_validate_chunk_crcs(true);
-        let mut reader = LinearReader::new_with_options(options);
-        for decoder in [chunk::zstd(), chunk::lz4()] {
-            reader
-                .add_decompressor(decoder)
-                .map_err(|source| RecordingError::Container { path: path.into(), source })?;
-        }
+            .with_emit_chunks(true);
         Ok(Stream {
             path: path.into(),
             file,
-            reader,
+            reader: LinearReader::new_with_options(options),
+            chunk: Chunk::default(),
             channels: ChannelAccumulator::default(),
             end: None,
         })
@@ -81,30 +77,42 @@ impl Stream {
         self.end
     }
 
-    /// The next message; `None` at the end of the data, or where a cut-off file stops.
+    /// The next message; `None` at the end of the data, or where a cut-off file stops. After an
+    /// error in one chunk the messages of the next chunk follow; damage between chunks is the end.
     pub(super) fn next(&mut self) -> Option<Result<Raw, RecordingError>> {
         if self.end.is_some() {
             return None;
         }
-        match self.step() {
-            Ok(Some(raw)) => Some(Ok(raw)),
-            Ok(None) => {
-                self.end = Some(End::Complete);
-                None
+        loop {
+            if let Some(raw) = self.next_of_chunk() {
+                return Some(raw.map_err(|source| self.failed(source)));
             }
-            // No magic at all is another kind of file, not a recording cut off.
-            Err(Failure::Container(McapError::UnexpectedEof)) if self.started() => {
-                self.end = Some(End::CutOff);
-                None
+            match self.next_outside() {
+                Ok(Outside::Message(raw)) => return Some(Ok(raw)),
+                Ok(Outside::Chunk(Ok(chunk))) => self.chunk = chunk,
+                Ok(Outside::Chunk(Err(source))) => return Some(Err(self.failed(source))),
+                Ok(Outside::End) => {
+                    self.end = Some(End::Complete);
+                    return None;
+                }
+                // No magic at all is another kind of file, not a recording cut off.
+                Err(McapError::UnexpectedEof) if self.started() => {
+                    self.end = Some(End::CutOff);
+                    return None;
+                }
+                Err(source) => {
+                    self.end = Some(End::Damaged);
+                    return Some(Err(self.failed(source)));
+                }
             }
-            Err(failure) => {
-                self.end = Some(End::Damaged);
-                let path = self.path.clone();
-                Some(Err(match failure {
-                    Failure::Container(source) => RecordingError::Container { path, source },
-                    Failure::File(source) => RecordingError::File { path, source },
-                }))
-            }
+        }
+    }
+
+    fn failed(&self, source: McapError) -> RecordingError {
+        let path = self.path.clone();
+        match source {
+            McapError::Io(source) if self.end.is_some() => RecordingError::File { path, source },
+            source => RecordingError::Container { path, source },
         }
     }
 
@@ -113,20 +121,42 @@ impl Stream {
         (&self.file).stream_position().is_ok_and(|position| position >= mcap::MAGIC.len() as u64)
     }
 
-    fn step(&mut self) -> Result<Option<Raw>, Failure> {
+    /// The next message of the chunk that was read last.
+    fn next_of_chunk(&mut self) -> Option<McapResult<Raw>> {
         loop {
-            let Some(event) = self.reader.next_event() else { return Ok(None) };
+            let record = self.chunk.next()?;
+            match record.and_then(|(opcode, data)| take(&mut self.channels, opcode, data)) {
+                Ok(None) => {}
+                Ok(Some(raw)) => return Some(Ok(raw)),
+                Err(error) => {
+                    self.chunk = Chunk::default();
+                    return Some(Err(error));
+                }
+            }
+        }
+    }
+
+    /// The next chunk, or message outside a chunk.
+    fn next_outside(&mut self) -> McapResult<Outside> {
+        loop {
+            let Some(event) = self.reader.next_event() else { return Ok(Outside::End) };
             match event? {
                 LinearReadEvent::ReadRequest(wanted) => {
                     let buffer = self.reader.insert(wanted.min(READ_AT_ONCE));
-                    let got = read_some(&mut self.file, buffer).map_err(Failure::File)?;
+                    let got = read_some(&mut self.file, buffer)?;
                     self.reader.notify_read(got);
                 }
                 // The summary behind it repeats what we know.
-                LinearReadEvent::Record { opcode: op::DATA_END, .. } => return Ok(None),
+                LinearReadEvent::Record { opcode: op::DATA_END, .. } => return Ok(Outside::End),
+                LinearReadEvent::Record { opcode: op::CHUNK, data } => {
+                    if let Record::Chunk { header, data } = parse_record(op::CHUNK, data)? {
+                        let chunk = Chunk::unpack(&header, &data, LARGEST_RECORD);
+                        return Ok(Outside::Chunk(chunk));
+                    }
+                }
                 LinearReadEvent::Record { opcode, data } => {
                     if let Some(raw) = take(&mut self.channels, opcode, data)? {
-                        return Ok(Some(raw));
+                        return Ok(Outside::Message(raw));
                     }
                 }
             }
@@ -134,15 +164,11 @@ impl Stream {
     }
 }
 
-enum Failure {
-    Container(McapError),
-    File(std::io::Error),
-}
-
-impl From<McapError> for Failure {
-    fn from(error: McapError) -> Self {
-        Failure::Container(error)
-    }
+/// What stands next to each other in a file.
+enum Outside {
+    Message(Raw),
+    Chunk(McapResult<Chunk>),
+    End,
 }
 
 fn read_some(file: &mut File, buffer: &mut [u8]) -> std::io::Result<usize> {
@@ -160,7 +186,7 @@ fn take(
     channels: &mut ChannelAccumulator<'static>,
     opcode: u8,
     data: &[u8],
-) -> Result<Option<Raw>, McapError> {
+) -> McapResult<Option<Raw>> {
     if ![op::SCHEMA, op::CHANNEL, op::MESSAGE].contains(&opcode) {
         return Ok(None);
     }

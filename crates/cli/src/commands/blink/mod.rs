@@ -10,7 +10,7 @@ mod request;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use vergence_landmark::{Finder, FinderError, paper};
+use vergence_landmark::{Finder, FinderError, paper, sequential};
 
 use self::report::Report;
 use self::request::BlinkRequest;
@@ -21,6 +21,8 @@ use crate::failure::Failure;
 enum Method {
     /// The on/off difference with projection histograms of the 2005 paper.
     Paper,
+    /// Soft evidence weighed frame by frame, with a stated rate of false alarms.
+    Sequential,
 }
 
 /// Find blinking landmarks in a recording.
@@ -36,7 +38,7 @@ pub struct Args {
     #[arg(long, conflicts_with_all = ["recording", "request"], requires = "out")]
     episodes: Option<PathBuf>,
     /// How to look
-    #[arg(long, value_enum, default_value = "paper")]
+    #[arg(long, value_enum, default_value = "sequential")]
     method: Method,
     /// Print one JSON document instead of text
     #[arg(long)]
@@ -105,6 +107,11 @@ fn look(recording: &Path, request: &Path, method: Method) -> Result<Report, Fail
             let finder = paper::PaperFinder::new(request.requests()?, paper::Config::default());
             Box::new(finder.map_err(|e| refused(&e))?)
         }
+        Method::Sequential => {
+            let config = sequential::Config::default();
+            let finder = sequential::SequentialFinder::new(request.requests()?, config);
+            Box::new(finder.map_err(|e| refused(&e))?)
+        }
     };
     let started = Instant::now();
     let (mut frames, mut first) = (0, None);
@@ -116,6 +123,7 @@ fn look(recording: &Path, request: &Path, method: Method) -> Result<Report, Fail
         finder.push(&frame).map_err(|e| refused(&e))?;
         frames += 1;
     }
+    finder.finish();
     let Some(first) = first else {
         let message = format!("{}: no image on `{}`", recording.display(), request.camera);
         return Err(Failure::misuse(message, "name the image topic as `camera` in the request"));
