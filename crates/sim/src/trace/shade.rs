@@ -164,9 +164,10 @@ fn surfaces(scene: &Scene, packet: &Packet, pixel: f32) -> [Surface; LANES] {
         };
         *s = Surface { point, normal, view, albedo: 0.0, body: index, kind };
     }
-    let mut footprint = packet.t;
-    for f in &mut footprint {
-        *f *= pixel;
+    // A pixel is longer on a surface that is seen at a flat angle.
+    let mut footprint = [0.0; LANES];
+    for (i, s) in surfaces.iter().enumerate() {
+        footprint[i] = packet.t[i] * pixel / (-dot(s.view, s.normal)).max(0.25);
     }
     // Textures of all eight lanes at once; packets rarely show more than one body.
     let mut done = [false; LANES];
