@@ -1,4 +1,5 @@
 //! The simulated devices through the traits alone, and their agreement with the geometry.
+#![allow(clippy::unwrap_used)]
 
 use std::time::Duration;
 
