@@ -156,7 +156,8 @@ impl Search<'_> {
         let mut others: Vec<&(Refined, Explained)> = Vec::new();
         for candidate in &sorted[1..] {
             let away = |p: &Transform| {
-                symmetry.angle_between(&p.rotation, &candidate.0.pose.rotation) > self.config.different
+                symmetry.angle_between(&p.rotation, &candidate.0.pose.rotation)
+                    > self.config.different
             };
             if away(&best.pose) && others.iter().all(|o| away(&o.0.pose)) {
                 others.push(candidate);
@@ -165,10 +166,7 @@ impl Search<'_> {
         let odds = |e: &Explained| (e.evidence - explained.evidence).exp();
         let total = 1.0 + others.iter().map(|o| odds(&o.1)).sum::<f64>();
         let found = ObjectPose {
-            pose: GaussianPose {
-                pose: best.pose,
-                covariance: best.covariance,
-            },
+            pose: GaussianPose { pose: best.pose, covariance: best.covariance },
             confidence: 1.0 / total,
             coverage: explained.coverage,
             alternatives: others
@@ -197,11 +195,31 @@ pub fn diagnose(views: &[View], query: &Query, config: &Config, truth: &Transfor
     let show = |name: &str, start: &Transform| {
         let (r, e) = search.refine_and_weigh(start);
         let d = vergence_geometry::gaussian::difference(truth, &r.pose);
-        println!("{name}: rot {:.2} deg pos {:.2} mm  ({:.2},{:.2},{:.2}) evidence {:.1} cov {:.2} scatter {:.2} own {:?} size {:.4} strain {:.1} sd {:.2}mm", d.fixed_rows::<3>(0).norm().to_degrees(), 1e3*d.fixed_rows::<3>(3).norm(), 1e3*d[3],1e3*d[4],1e3*d[5], e.evidence, e.coverage, e.scatter_px, r.nuisances.iter().map(|n| (n.0.z*100.0).round()/100.0).collect::<Vec<_>>(), r.log_size, r.strain, 1e3*(r.covariance[(3,3)]+r.covariance[(4,4)]+r.covariance[(5,5)]).sqrt());
+        println!(
+            "{name}: rot {:.2} deg pos {:.2} mm  ({:.2},{:.2},{:.2}) evidence {:.1} cov {:.2} scatter {:.2} own {:?} size {:.4} strain {:.1} sd {:.2}mm",
+            d.fixed_rows::<3>(0).norm().to_degrees(),
+            1e3 * d.fixed_rows::<3>(3).norm(),
+            1e3 * d[3],
+            1e3 * d[4],
+            1e3 * d[5],
+            e.evidence,
+            e.coverage,
+            e.scatter_px,
+            r.nuisances.iter().map(|n| (n.0.z * 100.0).round() / 100.0).collect::<Vec<_>>(),
+            r.log_size,
+            r.strain,
+            1e3 * (r.covariance[(3, 3)] + r.covariance[(4, 4)] + r.covariance[(5, 5)]).sqrt()
+        );
         r
     };
     for (i, s) in sights.iter().enumerate() {
-        println!("view {i} scale {} {}x{} noise {:.2}", s.coarse.scale, s.coarse.width(), s.coarse.height(), s.coarse.noise);
+        println!(
+            "view {i} scale {} {}x{} noise {:.2}",
+            s.coarse.scale,
+            s.coarse.width(),
+            s.coarse.height(),
+            s.coarse.noise
+        );
     }
     let r = show("from truth", truth);
     // residuals at truth
@@ -209,21 +227,58 @@ pub fn diagnose(views: &[View], query: &Query, config: &Config, truth: &Transfor
     for (v, s) in sights.iter().enumerate() {
         let mut out = Vec::new();
         let level = s.fine.as_ref().unwrap_or(&s.coarse);
-        sites::sites(&mut out, s, v, level, &model, &sites::State{pose: truth, log_size: 0.0, nuisance: Default::default()}, query.up, &layout);
-        
+        sites::sites(
+            &mut out,
+            s,
+            v,
+            level,
+            &model,
+            &sites::State { pose: truth, log_size: 0.0, nuisance: Default::default() },
+            query.up,
+            &layout,
+        );
+
         let mut by: std::collections::BTreeMap<usize, Vec<f64>> = Default::default();
         let mut all = Vec::new();
         for site in &out {
             let sign = 1.0;
-            if let Some(n) = site.edges().iter().map(|c| c.offset * sign).min_by(|a, b| a.abs().total_cmp(&b.abs())) {
-                if n.abs() < 1.5 { by.entry(site.segment).or_default().push(n); if site.kind == crate::Kind::Silhouette && !site.contact { all.push(n); } }
+            if let Some(n) = site
+                .edges()
+                .iter()
+                .map(|c| c.offset * sign)
+                .min_by(|a, b| a.abs().total_cmp(&b.abs()))
+            {
+                if n.abs() < 1.5 {
+                    by.entry(site.segment).or_default().push(n);
+                    if site.kind == crate::Kind::Silhouette && !site.contact {
+                        all.push(n);
+                    }
+                }
             }
         }
         all.sort_by(f64::total_cmp);
-        println!("view {v}: sites {} silhouette median outward {:.3} iqr {:.3}", out.len(), all.get(all.len()/2).unwrap_or(&f64::NAN), all.get(all.len()*3/4).unwrap_or(&f64::NAN) - all.get(all.len()/4).unwrap_or(&f64::NAN));
-        if by.len() < 12 { for (k, mut v) in by { v.sort_by(f64::total_cmp); let kind = out.iter().find(|s| s.segment == k).map(|s| s.kind); let c = out.iter().any(|s| s.segment == k && s.contact); print!("  seg {k} {kind:?} {c} n {} med {:.2};", v.len(), v[v.len()/2]); } println!(); }
+        println!(
+            "view {v}: sites {} silhouette median outward {:.3} iqr {:.3}",
+            out.len(),
+            all.get(all.len() / 2).unwrap_or(&f64::NAN),
+            all.get(all.len() * 3 / 4).unwrap_or(&f64::NAN)
+                - all.get(all.len() / 4).unwrap_or(&f64::NAN)
+        );
+        if by.len() < 12 {
+            for (k, mut v) in by {
+                v.sort_by(f64::total_cmp);
+                let kind = out.iter().find(|s| s.segment == k).map(|s| s.kind);
+                let c = out.iter().any(|s| s.segment == k && s.contact);
+                print!("  seg {k} {kind:?} {c} n {} med {:.2};", v.len(), v[v.len() / 2]);
+            }
+            println!();
+        }
     }
     let _ = r;
     let hypotheses = search.hypotheses();
-    for h in &hypotheses { let d = vergence_geometry::gaussian::difference(truth, &h.pose); print!("[start {:.1} deg ev {:.0}] ", d.fixed_rows::<3>(0).norm().to_degrees(), h.evidence); show("  hyp", &h.pose); }
+    for h in &hypotheses {
+        let d = vergence_geometry::gaussian::difference(truth, &h.pose);
+        print!("[start {:.1} deg ev {:.0}] ", d.fixed_rows::<3>(0).norm().to_degrees(), h.evidence);
+        show("  hyp", &h.pose);
+    }
 }

@@ -12,8 +12,8 @@
 //! begins, is measured only coarsely.
 
 use nalgebra::{Matrix3, Matrix6, SMatrix, SVector, Vector3};
-use vergence_geometry::gaussian::{perturb, skew};
 use vergence_geometry::Transform;
+use vergence_geometry::gaussian::{perturb, skew};
 
 use super::search::Search;
 use super::sites::{Layout, Nuisance, Site, State, sites};
