@@ -16,7 +16,7 @@ use crate::lights::{Flicker, Play};
 use crate::noise::{normal_table, stream};
 use crate::placement::to_single;
 use crate::scene::{Emitter, LAYERS, Layer, Scene};
-use crate::trace::{LANES, RayGrid, Rendering, clear_share, is_clear, render};
+use crate::trace::{LANES, RayGrid, Rendering, Stage, clear_share, is_clear, render};
 
 /// Exposure at which the lights' strengths are given (s).
 pub const REFERENCE_EXPOSURE: f64 = 0.004;
@@ -44,7 +44,7 @@ pub struct Capture {
     /// Lights that may blink, those that are dark included.
     pub blinkers: Vec<Blinker>,
     /// What stands where.
-    pub scene: Arc<Scene>,
+    pub stage: Arc<Stage>,
 }
 
 /// Light of an emitter that reaches the sensor as one blurred point.
@@ -59,7 +59,7 @@ struct Spot {
 
 struct Still {
     base_from_optical: Transform,
-    scene: Arc<Scene>,
+    stage: Arc<Stage>,
     layers: Rendering,
     spots: Vec<Spot>,
 }
@@ -109,7 +109,7 @@ impl Sensor {
         let base_from_optical = capture.base_from_optical[self.side];
         let fresh = self.still.as_ref().is_none_or(|still| {
             still.base_from_optical != base_from_optical
-                || !Arc::ptr_eq(&still.scene, &capture.scene)
+                || !Arc::ptr_eq(&still.stage, &capture.stage)
         });
         if fresh {
             self.still = Some(self.look(capture, base_from_optical));
@@ -125,14 +125,20 @@ impl Sensor {
     }
 
     fn look(&self, capture: &Capture, base_from_optical: Transform) -> Still {
-        let sharp = render(&capture.scene, &self.grid, &base_from_optical);
+        let sharp = render(&capture.stage, &self.grid, &base_from_optical);
         let taps = kernel::gaussian_taps(self.settings.psf_sigma_px as f32);
         let layers = sharp.map(|layer| kernel::convolve_separable(&layer, &taps));
         let mut spots = Vec::new();
         for (index, blinker) in capture.blinkers.iter().enumerate() {
-            self.spots(&capture.scene, &base_from_optical, index, &blinker.emitter, &mut spots);
+            self.spots(
+                &capture.stage.scene,
+                &base_from_optical,
+                index,
+                &blinker.emitter,
+                &mut spots,
+            );
         }
-        Still { base_from_optical, scene: capture.scene.clone(), layers, spots }
+        Still { base_from_optical, stage: capture.stage.clone(), layers, spots }
     }
 
     /// Where an emitter's light falls on the sensor, directly and by the glossy table.

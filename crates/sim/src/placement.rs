@@ -181,7 +181,7 @@ fn tag_housing(site: &LandmarkSite, base_from_object: &Transform) -> Body {
     let mut body = Body::new(
         solid,
         &(base_from_object * place),
-        Material::matt(0.06, Texture::Plain, 1).glossy(0.02, 30.0),
+        Material::matt(0.06, Texture::Plain, 1).glossy(0.02),
     );
     body.shadow = false;
     body
@@ -202,7 +202,7 @@ fn material(surface: Surface, solid: &Solid, rng: &mut Pcg64Mcg) -> Material {
         Surface::Striped => Texture::Stripes { width: 0.18 * height, ratio: 0.4 },
         Surface::Speckled => Texture::Grain { size: 0.02, contrast: 0.5 },
     };
-    Material::matt(albedo, texture, seed).glossy(rng.random_range(0.01..0.05), 40.0)
+    Material::matt(albedo, texture, seed).glossy(rng.random_range(0.01..0.05))
 }
 
 /// Table, floor, walls and lamps.
@@ -213,7 +213,7 @@ fn room(light: &LightSettings, rng: &mut Pcg64Mcg) -> Scene {
         body
     };
     let seed: u32 = rng.random();
-    let wood = Material::matt(0.42, Texture::Wood, seed).glossy(0.035, 60.0);
+    let wood = Material::matt(0.42, Texture::Wood, seed).glossy(0.035);
     let wall = |albedo, k| Material::matt(albedo, Texture::Backdrop, seed.wrapping_add(k));
     let floor = Material::matt(0.2, Texture::Grain { size: 0.3, contrast: 0.6 }, seed);
     let half_x = (0.5 * (TABLE[1] - TABLE[0])) as f32;
@@ -442,7 +442,7 @@ impl Builder {
                 Translation3::new(x, y, half[2]),
                 UnitQuaternion::from_euler_angles(0.0, 0.0, yaw),
             );
-            let surface = Material::matt(0.09, Texture::Plain, 5).glossy(0.04, 40.0);
+            let surface = Material::matt(0.09, Texture::Plain, 5).glossy(0.04);
             let body = Body::new(Solid::Box(half.map(|h| h as f32)), &place, surface);
             let clear_of = |builder: &Self| builder.hides_little(objects);
             if self.try_add(body, objects, clear_of) {

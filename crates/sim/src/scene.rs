@@ -30,8 +30,6 @@ pub struct Material {
     pub seed: u32,
     /// Mirror-like share at normal incidence.
     pub gloss: f32,
-    /// Sharpness of highlights (Phong exponent).
-    pub shininess: f32,
     /// Own light on the layer [`Layer::Screen`], relative to white.
     pub glow: f32,
 }
@@ -39,12 +37,12 @@ pub struct Material {
 impl Material {
     /// A matt surface.
     pub fn matt(albedo: f32, texture: Texture, seed: u32) -> Self {
-        Material { albedo, texture, seed, gloss: 0.0, shininess: 20.0, glow: 0.0 }
+        Material { albedo, texture, seed, gloss: 0.0, glow: 0.0 }
     }
 
     /// The same surface with a shine.
-    pub fn glossy(self, gloss: f32, shininess: f32) -> Self {
-        Material { gloss, shininess, ..self }
+    pub fn glossy(self, gloss: f32) -> Self {
+        Material { gloss, ..self }
     }
 }
 

@@ -20,6 +20,7 @@ use crate::noise::{normal, stream};
 use crate::placement::{RestView, TaggedObject, compose};
 use crate::radio::{Air, SimRadio, Tag};
 use crate::servo::Servo;
+use crate::trace::Stage;
 use crate::world::{Shared, Shutter, TrueHead, World, lock};
 use crate::{EMBEDDED_CONFIG, EMBEDDED_URDF};
 
@@ -130,7 +131,7 @@ impl Workcell {
             tags,
             air: Air::new(seed),
             status,
-            scene: Arc::new(composition.scene),
+            stage: Arc::new(Stage::new(composition.scene)),
             shutter: Shutter { phase, period, exposure: c.exposure, readout },
             now: Duration::ZERO,
             frame: 0,

@@ -15,8 +15,8 @@ use crate::camera::{Blinker, Capture};
 use crate::config::SimConfig;
 use crate::placement::TaggedObject;
 use crate::radio::{Air, Tag};
-use crate::scene::Scene;
 use crate::servo::Servo;
+use crate::trace::Stage;
 
 /// A head as it really is.
 #[derive(Debug, Clone)]
@@ -73,7 +73,7 @@ pub struct World {
     pub(crate) tags: Vec<Tag>,
     pub(crate) air: Air,
     pub(crate) status: Option<Blinker>,
-    pub(crate) scene: Arc<Scene>,
+    pub(crate) stage: Arc<Stage>,
     pub(crate) shutter: Shutter,
     pub(crate) now: Duration,
     /// Number of the frame that is being exposed or comes next.
@@ -136,14 +136,14 @@ impl World {
                 tag.blinkers(object, &self.settings.led, end, &mut blinkers);
             }
             blinkers.extend(self.status.clone());
-            let scene = self.scene.clone();
+            let stage = self.stage.clone();
             let sequence = self.frame;
             self.captures.push_back(Capture {
                 sequence,
                 start,
                 base_from_optical,
                 blinkers,
-                scene,
+                stage,
             });
             while self.captures.len() > self.settings.camera.buffer_frames {
                 self.captures.pop_front();

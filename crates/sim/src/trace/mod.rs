@@ -8,6 +8,7 @@
 //! lamps, each probed with four shadow rays whose targets are interleaved over 2x2 pixels; pixels
 //! where the body or the surface changes against a neighbour are sampled eight times over.
 
+mod lightmap;
 mod packet;
 mod render;
 mod shade;
@@ -20,5 +21,20 @@ pub use shade::{clear_share, is_clear};
 pub use shape::{Placed, Solid};
 pub use texture::Texture;
 
-#[cfg(doc)]
 use crate::scene::Scene;
+
+/// A scene that stands still, with what is known of its light.
+#[derive(Debug)]
+pub struct Stage {
+    /// What stands where.
+    pub scene: Scene,
+    table_light: lightmap::Lightmap,
+}
+
+impl Stage {
+    /// Prepares a scene for rendering.
+    pub fn new(scene: Scene) -> Self {
+        let table_light = lightmap::Lightmap::new(&scene);
+        Stage { scene, table_light }
+    }
+}

@@ -1,7 +1,8 @@
 //! Eight rays at a time.
 //!
 //! Plain `[f32; 8]` loops that the compiler turns into vector code; one packet holds eight pixels,
-//! or eight samples of one pixel, lamp or LED.
+//! or eight samples of one pixel, lamp or LED. Vectors are written out: the closures of
+//! `array::map` are not inlined into functions that are compiled for wider vector units.
 
 /// Rays in a packet.
 pub const LANES: usize = 8;
@@ -37,16 +38,36 @@ impl Packet {
         Packet { origin, direction, t: reach, body: [u32::MAX; LANES], part: [0; LANES] }
     }
 
+    /// Rays of no length, to be aimed one by one.
+    #[inline(always)]
+    pub fn idle() -> Self {
+        let up = [[0.0; LANES], [0.0; LANES], [1.0; LANES]];
+        Packet::new([[0.0; LANES]; 3], up, [0.0; LANES])
+    }
+
+    /// Makes ray `i` run from one point to another.
+    #[inline(always)]
+    pub fn aim(&mut self, i: usize, from: V3, to: V3) {
+        let way = sub(to, from);
+        let length = dot(way, way).sqrt();
+        for k in 0..3 {
+            self.origin[k][i] = from[k];
+            self.direction[k][i] = way[k] / length;
+        }
+        self.t[i] = length;
+    }
+
     /// The point that ray `i` has reached.
     #[inline(always)]
     pub fn point(&self, i: usize) -> V3 {
-        [0, 1, 2].map(|k| self.origin[k][i] + self.t[i] * self.direction[k][i])
+        let (o, d, t) = (&self.origin, &self.direction, self.t[i]);
+        [o[0][i] + t * d[0][i], o[1][i] + t * d[1][i], o[2][i] + t * d[2][i]]
     }
 
     /// Direction of ray `i`.
     #[inline(always)]
     pub fn heading(&self, i: usize) -> V3 {
-        [0, 1, 2].map(|k| self.direction[k][i])
+        [self.direction[0][i], self.direction[1][i], self.direction[2][i]]
     }
 }
 
@@ -68,9 +89,14 @@ pub fn add_scaled(a: V3, b: V3, s: f32) -> V3 {
     [a[0] + s * b[0], a[1] + s * b[1], a[2] + s * b[2]]
 }
 
+/// `s a`.
+#[inline(always)]
+pub fn scaled(a: V3, s: f32) -> V3 {
+    [a[0] * s, a[1] * s, a[2] * s]
+}
+
 /// Unit vector.
 #[inline(always)]
 pub fn normalize(a: V3) -> V3 {
-    let scale = 1.0 / dot(a, a).sqrt().max(1e-20);
-    a.map(|x| x * scale)
+    scaled(a, 1.0 / dot(a, a).sqrt().max(1e-20))
 }

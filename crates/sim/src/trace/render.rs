@@ -1,9 +1,11 @@
 //! From a view to pictures of linear light.
 
+use multiversion::multiversion;
 use nalgebra::Point2;
 use vergence_geometry::{Camera, Transform};
 use vergence_imaging::Image;
 
+use super::Stage;
 use super::packet::{LANES, Packet, V3, dot, normalize, sub};
 use super::shade::{cast, shade};
 use crate::scene::{LAYERS, Scene};
@@ -78,29 +80,52 @@ impl Eye {
 
     #[inline(always)]
     fn turn(&self, d: V3) -> V3 {
-        self.rows.map(|row| dot(row, d))
+        [dot(self.rows[0], d), dot(self.rows[1], d), dot(self.rows[2], d)]
     }
 }
 
+/// Bodies that a tile of pixels may show.
+#[derive(Default)]
+struct Candidates {
+    direct: Vec<u16>,
+    mirrored: Vec<u16>,
+}
+
 /// Renders what a camera sees.
-pub fn render(scene: &Scene, grid: &RayGrid, base_from_optical: &Transform) -> Rendering {
+pub fn render(stage: &Stage, grid: &RayGrid, base_from_optical: &Transform) -> Rendering {
     let eye = Eye::new(base_from_optical);
+    let mut out = [(); LAYERS].map(|()| Image::filled(grid.width, grid.height, 0.0f32));
+    let surface = sample_pixels(stage, grid, &eye, &mut out);
+    refine_edges(stage, grid, &eye, &surface, &mut out);
+    out
+}
+
+/// One sample a pixel; returns which surface each pixel shows.
+#[multiversion(targets("x86_64+avx2", "aarch64+neon"))]
+fn sample_pixels(stage: &Stage, grid: &RayGrid, eye: &Eye, out: &mut Rendering) -> Image<u64> {
+    let scene = &stage.scene;
     let (width, height) = (grid.width, grid.height);
-    let mut out = [(); LAYERS].map(|()| Image::filled(width, height, 0.0f32));
     let mut surface = Image::filled(width, height, 0u64);
-    let mut candidates = Vec::new();
+    let mut candidates = Candidates::default();
     let mut scratch = Vec::new();
     for top in (0..height).step_by(TILE) {
         for left in (0..width).step_by(TILE) {
-            tile_candidates(scene, grid, &eye, left, top, &mut candidates);
+            tile_candidates(scene, grid, eye, left, top, &mut candidates);
             let right = (left + TILE).min(width);
             for y in top..(top + TILE).min(height) {
                 for x in (left..right).step_by(LANES) {
                     let pixel = |i: usize| ((x + i).min(width - 1), y, [0.0, 0.0]);
-                    let mut packet = primary(grid, &eye, pixel);
-                    cast(scene, &candidates, &mut packet);
+                    let mut packet = primary(grid, eye, pixel);
+                    cast(scene, &candidates.direct, &mut packet);
                     let phase = std::array::from_fn(|i| ((x + i) & 1 | (y & 1) << 1) as u8);
-                    let light = shade(scene, &packet, &phase, grid.pixel, true, &mut scratch);
+                    let light = shade(
+                        stage,
+                        &packet,
+                        &phase,
+                        grid.pixel,
+                        &candidates.mirrored,
+                        &mut scratch,
+                    );
                     for i in 0..LANES.min(right - x) {
                         surface.set(x + i, y, identity(scene, &packet, i));
                         for (layer, value) in out.iter_mut().zip(light[i]) {
@@ -111,8 +136,7 @@ pub fn render(scene: &Scene, grid: &RayGrid, base_from_optical: &Transform) -> R
             }
         }
     }
-    refine_edges(scene, grid, &eye, &surface, &mut out);
-    out
+    surface
 }
 
 /// Rays through pixels given per lane.
@@ -126,7 +150,8 @@ fn primary(grid: &RayGrid, eye: &Eye, pixel: impl Fn(usize) -> (usize, usize, [f
             direction[k][i] = d[k];
         }
     }
-    let origin = eye.position.map(|p| [p; LANES]);
+    let p = eye.position;
+    let origin = [[p[0]; LANES], [p[1]; LANES], [p[2]; LANES]];
     Packet::new(origin, direction, [f32::INFINITY; LANES])
 }
 
@@ -137,7 +162,7 @@ fn tile_candidates(
     eye: &Eye,
     left: usize,
     top: usize,
-    out: &mut Vec<u16>,
+    out: &mut Candidates,
 ) {
     let (right, bottom) = ((left + TILE).min(grid.width), (top + TILE).min(grid.height));
     let at = |x, y| normalize(eye.turn(grid.at(x, y, [0.0; 2])));
@@ -145,22 +170,32 @@ fn tile_candidates(
     let corners = [(left, top), (right - 1, top), (left, bottom - 1), (right - 1, bottom - 1)];
     let cos = corners.iter().map(|&(x, y)| dot(axis, at(x, y))).fold(1.0, f32::min);
     let half = cos.clamp(-1.0, 1.0).acos() + 1.5 * grid.pixel;
-    out.clear();
-    for (index, body) in scene.bodies.iter().enumerate() {
-        let to = sub(body.placed.centre(), eye.position);
+    out.direct.clear();
+    out.mirrored.clear();
+    let meets = |centre: V3, bound: f32| {
+        let to = sub(centre, eye.position);
         let distance = dot(to, to).sqrt();
-        let bound = body.placed.bound();
-        let meets = distance <= bound || {
+        distance <= bound || {
             let angle = (dot(to, axis) / distance).clamp(-1.0, 1.0).acos();
             angle <= half + (bound / distance).asin()
-        };
-        if meets {
-            out.push(index as u16);
+        }
+    };
+    let height = scene.table_height as f32;
+    for (index, body) in scene.bodies.iter().enumerate() {
+        let (centre, bound) = (body.placed.centre(), body.placed.bound());
+        if meets(centre, bound) {
+            out.direct.push(index as u16);
+        }
+        // Seen in the table, a body stands as deep below its top as it really stands above.
+        let image = [centre[0], centre[1], 2.0 * height - centre[2]];
+        if !body.mirror && meets(image, bound) {
+            out.mirrored.push(index as u16);
         }
     }
 }
 
 /// A number that changes where one surface ends and the next begins.
+#[inline(always)]
 fn identity(scene: &Scene, packet: &Packet, i: usize) -> u64 {
     let index = packet.body[i];
     let Some(body) = scene.bodies.get(index as usize) else { return u64::MAX };
@@ -170,15 +205,17 @@ fn identity(scene: &Scene, packet: &Packet, i: usize) -> u64 {
 }
 
 /// Samples pixels at the edges of surfaces eight times.
+#[multiversion(targets("x86_64+avx2", "aarch64+neon"))]
 fn refine_edges(
-    scene: &Scene,
+    stage: &Stage,
     grid: &RayGrid,
     eye: &Eye,
     surface: &Image<u64>,
     out: &mut Rendering,
 ) {
+    let scene = &stage.scene;
     let (width, height) = (grid.width, grid.height);
-    let mut candidates = Vec::new();
+    let mut candidates = Candidates::default();
     let mut scratch = Vec::new();
     for top in (0..height).step_by(TILE) {
         for left in (0..width).step_by(TILE) {
@@ -193,9 +230,16 @@ fn refine_edges(
                         listed = true;
                     }
                     let mut packet = primary(grid, eye, |i| (x, y, ROOKS[i]));
-                    cast(scene, &candidates, &mut packet);
+                    cast(scene, &candidates.direct, &mut packet);
                     let phase = std::array::from_fn(|i| i as u8);
-                    let light = shade(scene, &packet, &phase, grid.pixel, true, &mut scratch);
+                    let light = shade(
+                        stage,
+                        &packet,
+                        &phase,
+                        grid.pixel,
+                        &candidates.mirrored,
+                        &mut scratch,
+                    );
                     for (k, layer) in out.iter_mut().enumerate() {
                         let sum: f32 = light.iter().map(|l| l[k]).sum();
                         layer.set(x, y, sum / LANES as f32);

@@ -7,7 +7,9 @@
 use nalgebra::{Point3, Vector3};
 use vergence_geometry::Transform;
 
-use super::packet::{LANES, Lane, Lane3, NEAR, Packet, V3, dot, normalize, sub};
+use super::packet::{
+    LANES, Lane, Lane3, NEAR, Packet, V3, add_scaled, dot, normalize, scaled, sub,
+};
 
 /// Form of a solid; lengths in metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -115,8 +117,8 @@ impl Placed {
     /// A direction of the solid's frame in the base frame.
     #[inline(always)]
     pub fn outward(&self, v: V3) -> V3 {
-        let r = &self.rotation;
-        [0, 1, 2].map(|k| r[0][k] * v[0] + r[1][k] * v[1] + r[2][k] * v[2])
+        let [x, y, z] = self.rotation;
+        add_scaled(add_scaled(scaled(x, v[0]), y, v[1]), z, v[2])
     }
 
     /// True when a point (base frame) lies within the solid grown by `margin`; hollows count as in.
@@ -142,7 +144,7 @@ impl Placed {
     pub fn normal(&self, p: V3, part: u32) -> (V3, u32) {
         match self.solid {
             Solid::Box(h) => {
-                let q = [0, 1, 2].map(|k| p[k].abs() - h[k]);
+                let q = [p[0].abs() - h[0], p[1].abs() - h[1], p[2].abs() - h[2]];
                 let k = (0..3).fold(0, |best, k| if q[k] > q[best] { k } else { best });
                 let mut n = [0.0; 3];
                 n[k] = p[k].signum();
@@ -155,7 +157,7 @@ impl Placed {
                 let n = match part {
                     part::SIDE => side,
                     part::BOTTOM => [0.0, 0.0, -1.0],
-                    part::INSIDE => side.map(|x| -x),
+                    part::INSIDE => scaled(side, -1.0),
                     _ => [0.0, 0.0, 1.0],
                 };
                 (n, part)
@@ -259,12 +261,17 @@ fn cone(
         let c = ox * ox + oy * oy - radius * radius;
         let root2 = b * b - a * c;
         let root = root2.max(0.0).sqrt();
-        for t in [(-b - root) / a, (-b + root) / a] {
+        let inverse = 1.0 / a;
+        let (first, second) = ((-b - root) * inverse, (-b + root) * inverse);
+        let (near, far) = (first.min(second), first.max(second));
+        let valid = |t: f32| {
             let z = oz + t * dz;
-            let hit = root2 > 0.0 && z >= ends[0] && z <= ends[1] && t > NEAR && t < best[i];
-            best[i] = if hit { t } else { best[i] };
-            part[i] = if hit { which } else { part[i] };
-        }
+            (z >= ends[0]) & (z <= ends[1]) & (t > NEAR)
+        };
+        let t = if valid(near) { near } else { far };
+        let hit = valid(t) & (root2 > 0.0) & (t < best[i]);
+        best[i] = if hit { t } else { best[i] };
+        part[i] = if hit { which } else { part[i] };
     }
 }
 

@@ -2,7 +2,7 @@
 //!
 //! Octaves and edges fade out as their size nears the pixel's footprint, so that nothing aliases.
 
-use super::packet::V3;
+use super::packet::{LANES, Lane, Lane3, V3};
 
 /// How the albedo varies over a surface.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -52,33 +52,70 @@ fn lattice(x: i32, y: i32, z: i32, seed: u32) -> f32 {
         ^ seed.wrapping_mul(0x27D4_EB2F);
     h = (h ^ (h >> 15)).wrapping_mul(0x2C1B_3C6D);
     h = (h ^ (h >> 12)).wrapping_mul(0x297A_2D39);
-    (h >> 8) as f32 * (1.0 / 16_777_216.0)
+    // Through a signed number, which vector units convert.
+    (h >> 8) as i32 as f32 * (1.0 / 16_777_216.0)
 }
 
-/// Smooth value noise in [-1, 1].
+/// Largest whole number not above; without a library call.
 #[inline(always)]
-fn noise(p: V3, seed: u32) -> f32 {
-    let cell = p.map(f32::floor);
-    let [x, y, z] = cell.map(|c| c as i32);
-    let f = [0, 1, 2].map(|k| {
-        let t = p[k] - cell[k];
-        t * t * (3.0 - 2.0 * t)
-    });
-    let mix = |a: f32, b: f32, t: f32| a + (b - a) * t;
-    let edge = |y, z| mix(lattice(x, y, z, seed), lattice(x + 1, y, z, seed), f[0]);
-    let face = |z| mix(edge(y, z), edge(y + 1, z), f[1]);
-    2.0 * mix(face(z), face(z + 1), f[2]) - 1.0
+fn floor(x: f32) -> i32 {
+    // Plain casts saturate, which keeps them out of vector code; coordinates are far below 2^31.
+    let whole = x as i32;
+    whole - i32::from(x < whole as f32)
+}
+
+/// Points scaled about the origin.
+#[inline(always)]
+fn stretched(p: &Lane3, scale: f32) -> Lane3 {
+    let mut out = *p;
+    for value in out.iter_mut().flatten() {
+        *value *= scale;
+    }
+    out
+}
+
+/// `1 + contrast g`.
+#[inline(always)]
+fn raised(mut g: Lane, contrast: f32) -> Lane {
+    for value in &mut g {
+        *value = 1.0 + contrast * *value;
+    }
+    g
+}
+
+/// Smooth value noise in [-1, 1] at eight points.
+#[inline(always)]
+fn noise(p: &Lane3, seed: u32) -> Lane {
+    let mut out = [0.0; LANES];
+    for i in 0..LANES {
+        let (x, y, z) = (floor(p[0][i]), floor(p[1][i]), floor(p[2][i]));
+        let ease = |t: f32| t * t * (3.0 - 2.0 * t);
+        let (fx, fy, fz) =
+            (ease(p[0][i] - x as f32), ease(p[1][i] - y as f32), ease(p[2][i] - z as f32));
+        let mix = |a: f32, b: f32, t: f32| a + (b - a) * t;
+        let edge = |y, z| mix(lattice(x, y, z, seed), lattice(x + 1, y, z, seed), fx);
+        let face = |z| mix(edge(y, z), edge(y + 1, z), fy);
+        out[i] = 2.0 * mix(face(z), face(z + 1), fz) - 1.0;
+    }
+    out
 }
 
 /// Octaves of noise, from wavelength `size` down, faded at the footprint.
-fn grain(p: V3, size: f32, octaves: u32, footprint: f32, seed: u32) -> f32 {
-    let (mut sum, mut amplitude, mut wave) = (0.0, 0.6, size);
+#[inline(always)]
+fn grain(p: &Lane3, size: f32, octaves: u32, footprint: &Lane, seed: u32) -> Lane {
+    let (mut sum, mut amplitude, mut wave) = ([0.0; LANES], 0.6, size);
     for octave in 0..octaves {
-        let visible = (wave / (2.5 * footprint) - 1.0).clamp(0.0, 1.0);
-        if visible <= 0.0 {
+        let mut visible = [0.0; LANES];
+        for i in 0..LANES {
+            visible[i] = (wave / (2.5 * footprint[i]) - 1.0).clamp(0.0, 1.0);
+        }
+        if visible.iter().all(|v| *v <= 0.0) {
             break;
         }
-        sum += amplitude * visible * noise(p.map(|x| x / wave), seed.wrapping_add(octave));
+        let values = noise(&stretched(p, 1.0 / wave), seed.wrapping_add(octave));
+        for i in 0..LANES {
+            sum[i] += amplitude * visible[i] * values[i];
+        }
         (amplitude, wave) = (amplitude * 0.6, wave * 0.5);
     }
     sum
@@ -132,11 +169,45 @@ fn lettering(u: f32, v: f32, size: [f32; 2], footprint: f32, seed: u32) -> f32 {
 }
 
 impl Texture {
-    /// Factor on the material's albedo at a local point with local normal; `footprint` is the
-    /// width of a pixel there (m).
-    pub fn factor(&self, p: V3, n: V3, extent: Extent, footprint: f32, seed: u32) -> f32 {
+    /// Factors on the material's albedo at eight local points with local normals; `footprint` is
+    /// the width of a pixel there (m).
+    #[inline(always)]
+    pub fn factors(
+        &self,
+        p: &Lane3,
+        n: &Lane3,
+        extent: Extent,
+        footprint: &Lane,
+        seed: u32,
+    ) -> Lane {
+        let mut out = match *self {
+            Texture::Plain => raised(grain(p, 0.03, 2, footprint, seed), 0.04),
+            Texture::Grain { size, contrast } => {
+                raised(grain(p, size, 4, footprint, seed), contrast)
+            }
+            Texture::Wood => wood(p, footprint, seed),
+            Texture::Backdrop => backdrop(p, n, footprint, seed),
+            Texture::Stripes { .. } | Texture::Print { .. } => {
+                let mut out = [0.0; LANES];
+                for i in 0..LANES {
+                    let (at, normal) = ([p[0][i], p[1][i], p[2][i]], [n[0][i], n[1][i], n[2][i]]);
+                    out[i] = self.drawn(at, normal, extent, footprint[i], seed);
+                }
+                out
+            }
+        };
+        for o in &mut out {
+            *o = o.clamp(0.02, 2.0);
+        }
+        out
+    }
+
+    /// Textures with sharp edges, point by point.
+    fn drawn(&self, p: V3, n: V3, extent: Extent, footprint: f32, seed: u32) -> f32 {
         let flat = (0..3).fold(0, |best, k| if n[k].abs() > n[best].abs() { k } else { best });
         match *self {
+<<<<<<< HEAD
+=======
             Texture::Plain => 1.0 + 0.04 * grain(p, 0.03, 2, footprint, seed),
             Texture::Grain { size, contrast } => {
                 (1.0 + contrast * grain(p, size, 4, footprint, seed)).max(0.05)
@@ -151,11 +222,9 @@ impl Texture {
                 let at = [0, 1, 2].map(|k| fibre[k] + offset[k]);
                 (1.0 + tone + 0.22 * grain(at, 0.03, 4, footprint, seed)) * joint
             }
+>>>>>>> main
             Texture::Stripes { width, ratio } => {
-                let s = match flat {
-                    2 => p[0],
-                    _ => p[2],
-                };
+                let s = if flat == 2 { p[0] } else { p[2] };
                 let share = bands(s / (2.0 * width) + 0.25, footprint / (2.0 * width));
                 (1.0 - share) + ratio * share
             }
@@ -173,17 +242,60 @@ impl Texture {
                 };
                 1.0 - 0.78 * lettering(u, v, size, footprint, seed.wrapping_add(flat as u32))
             }
-            Texture::Backdrop => {
-                let soft = grain(p, 0.9, 4, footprint, seed);
-                let q = p.map(|x| x / 0.45);
-                let tile = q.map(|x| x.floor() as i32);
-                let tone = lattice(tile[0], tile[1], tile[2], seed);
-                let shelf = if tone > 0.6 { 1.4 - 1.6 * (tone - 0.6) } else { 1.0 };
-                (0.9 + 0.55 * soft) * shelf
-            }
+            _ => 1.0,
         }
-        .clamp(0.02, 2.0)
     }
+}
+
+/// Boards of 14 cm along x.
+#[inline(always)]
+fn wood(p: &Lane3, footprint: &Lane, seed: u32) -> Lane {
+    const BOARD: f32 = 0.14;
+    let mut at = *p;
+    let sway = noise(&stretched(p, 3.0), seed);
+    for i in 0..LANES {
+        let board = floor(p[1][i] / BOARD);
+        at[0][i] = p[0][i] * 0.12 + board as f32 * 7.3;
+        at[1][i] = p[1][i] + 0.02 * sway[i];
+    }
+    let fibre = grain(&at, 0.03, 4, footprint, seed);
+    let mut out = [0.0; LANES];
+    for i in 0..LANES {
+        let board = floor(p[1][i] / BOARD);
+        let tone = 0.16 * (lattice(board, 0, 0, seed) - 0.5);
+        let off = (p[1][i] / BOARD - board as f32 - 0.5).abs() * BOARD;
+        let joint = 1.0 - 0.5 * bar(0.5 * BOARD - 0.0012, BOARD, off, footprint[i]);
+        out[i] = (1.0 + tone + 0.24 * fibre[i]) * joint;
+    }
+    out
+}
+
+/// A wall with shelves of things and dark and bright patches, soft as out of focus.
+#[inline(always)]
+fn backdrop(p: &Lane3, n: &Lane3, footprint: &Lane, seed: u32) -> Lane {
+    let soft = grain(p, 0.8, 4, footprint, seed);
+    let mut out = [0.0; LANES];
+    for i in 0..LANES {
+        let across = if n[0][i].abs() > 0.5 { p[1][i] } else { p[0][i] };
+        // Two rows of shelves; on each, things of various widths and heights.
+        let row = p[2][i] / 0.34;
+        let shelf = floor(row);
+        let height = row - shelf as f32;
+        let cell = across / 0.11;
+        let thing = floor(cell);
+        let pick = |k| lattice(thing, shelf, k, seed);
+        let f = (footprint[i] / 0.11).max(0.06);
+        let body = bar(0.08, 0.5 + 0.5 * pick(1), cell - thing as f32, f)
+            * bar(0.1, 0.35 + 0.55 * pick(2), height, f)
+            * if pick(3) > 0.25 { 1.0 } else { 0.0 };
+        let board = bar(0.0, 0.09, height, f);
+        let wall = 1.0 + 0.4 * soft[i];
+        let stocked = if (shelf == -1) | (shelf == 0) | (shelf == 2) { 1.0 } else { 0.0 };
+        let tone = 0.25 + 1.2 * pick(4) + 0.3 * soft[i];
+        let front = wall + stocked * (board * (0.55 - wall) + body * (tone - wall));
+        out[i] = front * (0.85 + 0.15 * soft[i]);
+    }
+    out
 }
 
 #[cfg(test)]
@@ -192,8 +304,8 @@ mod tests {
 
     #[test]
     fn noise_is_bounded_and_varies() {
-        let values: Vec<f32> =
-            (0..1000).map(|k| noise([k as f32 * 0.37, k as f32 * 0.11, 0.5], 7)).collect();
+        let row = |k: usize| [0.37, 0.11, 0.0].map(|s| [k as f32 * s; LANES]);
+        let values: Vec<f32> = (0..1000).map(|k| noise(&row(k), 7)[0]).collect();
         assert!(values.iter().all(|v| v.abs() <= 1.0));
         let mean = values.iter().sum::<f32>() / 1000.0;
         let spread = values.iter().map(|v| (v - mean).powi(2)).sum::<f32>() / 1000.0;
@@ -204,7 +316,7 @@ mod tests {
     fn a_coarse_pixel_sees_the_mean() {
         let stripes = Texture::Stripes { width: 0.005, ratio: 0.2 };
         let at = |z: f32, footprint: f32| {
-            stripes.factor([0.03, 0.0, z], [1.0, 0.0, 0.0], Extent::Round(0.03), footprint, 1)
+            stripes.drawn([0.03, 0.0, z], [1.0, 0.0, 0.0], Extent::Round(0.03), footprint, 1)
         };
         assert!((at(0.001, 0.2) - 0.6).abs() < 1e-5);
         let fine: Vec<f32> = (0..100).map(|k| at(k as f32 * 1e-4, 1e-4)).collect();
