@@ -24,6 +24,7 @@ pub mod motion;
 pub mod nuisance;
 pub mod scan;
 pub mod shift;
+pub mod surroundings;
 pub mod template;
 mod verdict;
 
