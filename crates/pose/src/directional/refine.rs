@@ -12,8 +12,8 @@
 //! begins, is measured only coarsely.
 
 use nalgebra::{Matrix3, Matrix6, SMatrix, SVector, Vector3};
-use vergence_geometry::gaussian::{perturb, skew};
 use vergence_geometry::Transform;
+use vergence_geometry::gaussian::{perturb, skew};
 
 use super::search::Search;
 use super::sites::{Layout, Nuisance, Site, State, sites};
@@ -43,8 +43,8 @@ pub fn absence(kind: Kind) -> f64 {
 const CONTACT_SD_PX: f64 = 1.2;
 /// Deviation of the swelling of silhouettes (px).
 const SWELL_SD_PX: f64 = 0.3;
-/// Deviation of the logarithm of the object's size: half a percent.
-const SIZE_SD: f64 = 0.005;
+/// Deviation of the logarithm of the object's size: one percent.
+const SIZE_SD: f64 = 0.01;
 
 /// Deviation of a site's edge when a pass works with `sd`.
 pub fn deviation(site: &Site, sd: f64) -> f64 {
