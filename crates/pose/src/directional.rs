@@ -167,7 +167,7 @@ impl Search<'_> {
         passes.push(last);
         let mut refined = self.refine(start, &passes);
         self.lay_out(&mut refined, &last);
-        let mut explained = verdict::weigh(&refined.sites, last.layout.range_px, 0.6);
+        let mut explained = verdict::weigh(&refined.sites, last.layout.range_px, 0.4);
         explained.evidence -= refined.strain;
         (refined, explained)
     }
