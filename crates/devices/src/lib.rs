@@ -12,6 +12,6 @@ mod traits;
 pub use config::{Config, ConfigError};
 pub use description::{Description, DescriptionError};
 pub use traits::{
-    Advertisement, Camera, Clock, DeviceError, Head, JointReading, LedCommand, Robot, Side,
-    TagAddress, TagLink, TagState,
+    Advertisement, Camera, Clock, DeviceError, Head, JointReading, LedCommand, PanTilt, Robot,
+    Side, TagAddress, TagLink, TagState,
 };

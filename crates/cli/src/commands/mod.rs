@@ -1,7 +1,11 @@
 //! One module a command: its arguments and what it does. Adding a command is a module here, a
 //! variant of [`Command`] and a line in [`run`].
 
+mod blink;
+mod experiment;
+mod find;
 mod pose;
+mod tags;
 
 use clap::Subcommand;
 
@@ -10,6 +14,14 @@ use crate::failure::Failure;
 /// What the program can do.
 #[derive(Subcommand)]
 pub enum Command {
+    /// Find an object and recognise its pose.
+    Find(find::Find),
+    /// List the tags in radio range with their records.
+    Tags(tags::Tags),
+    /// Run one of the paper's experiments in the simulated workcell, with statistics.
+    Experiment(experiment::Experiment),
+    /// Find blinking landmarks in a recording.
+    Blink(blink::Args),
     /// Recognise objects of known size in a set of pictures.
     Pose(pose::PoseArgs),
 }
@@ -17,6 +29,10 @@ pub enum Command {
 /// Runs a command; `true` when the thing asked for was achieved.
 pub fn run(command: Command) -> Result<bool, Failure> {
     match command {
+        Command::Find(args) => find::run(&args),
+        Command::Tags(args) => tags::run(&args),
+        Command::Experiment(args) => experiment::run(&args),
+        Command::Blink(args) => blink::run(args),
         Command::Pose(args) => pose::run(args),
     }
 }

@@ -1,0 +1,35 @@
+//! The stereo pan-tilt head: two cameras, each on a pan and a tilt servo.
+//!
+//! In come joint angles (rad) and pixels, out come a point in the `base` frame with its covariance,
+//! and the angles to turn to next. Nothing here touches a device: the orchestration moves servos and
+//! asks these functions what follows.
+//!
+//! ```text
+//! Search  -> where to look next until both heads see the light
+//! Fixator -> from the residual pixel to the next angles, until the light is centred
+//! triangulate / paper_distance -> where the light is
+//! ```
+//!
+//! Pairs are in the order left, right. `angles` are always `[pan, tilt]`, pan positive to the left,
+//! tilt positive downwards.
+
+// An index names a head or a joint in several arrays at once; zipped iterators would hide which.
+#![allow(clippy::needless_range_loop)]
+
+mod fixation;
+mod kinematics;
+mod paper;
+mod search;
+mod triangulation;
+
+pub use fixation::{Fixator, FixatorConfig, NextMove, dither};
+pub use kinematics::{HeadError, PanTiltHead};
+pub use paper::{PaperAngles, paper_distance};
+pub use search::{Field, Search, SearchConfig};
+pub use triangulation::{
+    Fixation, GATE_SIGMAS, Landmark, Noise, TriangulateError, epipolar_gap, triangulate,
+    triangulate_many,
+};
+
+#[cfg(test)]
+mod testing;
