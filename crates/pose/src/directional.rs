@@ -9,6 +9,7 @@
 pub mod edges;
 pub mod field;
 pub mod level;
+pub mod picture;
 pub mod refine;
 pub mod search;
 pub mod sites;
@@ -23,7 +24,7 @@ use field::Field;
 use level::{Level, Region};
 use refine::{EDGE_SD_PX, Pass, Refined};
 use search::{Search, Sight};
-use sites::Layout;
+use sites::{Layout, Site};
 use verdict::Explained;
 
 /// Settings of the directional method.
@@ -69,8 +70,29 @@ impl Default for Config {
     }
 }
 
+/// What a recognition saw on its way, for pictures.
+pub struct Trace<'a> {
+    /// The prepared views.
+    pub sights: Vec<Sight<'a>>,
+    /// The object's form.
+    pub model: Model,
+    /// Refined poses that differ, best first.
+    pub poses: Vec<Transform>,
+    /// The sites of the best pose.
+    pub sites: Vec<Site>,
+}
+
 /// The object's pose from the edges of one or more pictures, its rotation unknown.
 pub fn recognise(views: &[View], query: &Query, config: &Config) -> Result<ObjectPose, Refusal> {
+    recognise_traced(views, query, config).map_or_else(Err, |(result, _)| result)
+}
+
+/// [`recognise`] with what it saw, unless it could not even begin.
+pub fn recognise_traced<'a>(
+    views: &[View<'a>],
+    query: &Query,
+    config: &Config,
+) -> Result<(Result<ObjectPose, Refusal>, Trace<'a>), Refusal> {
     let (landmark, normal) = check(views, query)?;
     let model = Model::new(query.record);
     let sights = prepare(views, query, landmark, config);
@@ -79,13 +101,14 @@ pub fn recognise(views: &[View], query: &Query, config: &Config) -> Result<Objec
     }
     let search = Search { sights: &sights, model: &model, query, landmark, normal, config };
     let hypotheses = search.hypotheses();
-    if hypotheses.is_empty() {
-        return Err(Refusal::NoAttitude);
-    }
     let mut refined: Vec<(Refined, Explained)> =
         hypotheses.iter().map(|h| search.refine_and_weigh(&h.pose)).collect();
     refined.sort_by(|a, b| b.1.evidence.total_cmp(&a.1.evidence));
-    search.judge_best(&refined)
+    let different = search.different(refined);
+    let result = search.verdict(&different);
+    let poses = different.iter().map(|(r, _)| r.pose).collect();
+    let sites = different.into_iter().next().map(|(r, _)| r.sites).unwrap_or_default();
+    Ok((result, Trace { sights, model, poses, sites }))
 }
 
 /// Gradients, edges and fields of the views that can show the object.
@@ -144,25 +167,32 @@ impl Search<'_> {
         passes.push(last);
         let mut refined = self.refine(start, &passes);
         self.lay_out(&mut refined, &last);
-        let mut explained = verdict::weigh(&refined.sites, last.layout.range_px, 0.6);
+        let mut explained = verdict::weigh(&refined.sites, last.layout.range_px, 0.4);
         explained.evidence -= refined.strain;
         (refined, explained)
     }
 
-    /// The best pose with its belief against the different ones, or a refusal.
-    fn judge_best(&self, sorted: &[(Refined, Explained)]) -> Result<ObjectPose, Refusal> {
+    /// Of a list that is sorted best first, those that differ from every better one.
+    fn different(&self, sorted: Vec<(Refined, Explained)>) -> Vec<(Refined, Explained)> {
         let symmetry = self.query.symmetry();
-        let (best, explained) = sorted.first().ok_or(Refusal::NoAttitude)?;
-        let mut others: Vec<&(Refined, Explained)> = Vec::new();
-        for candidate in &sorted[1..] {
-            let away = |p: &Transform| {
-                symmetry.angle_between(&p.rotation, &candidate.0.pose.rotation)
-                    > self.config.different
+        let mut kept: Vec<(Refined, Explained)> = Vec::new();
+        for candidate in sorted {
+            let turn = &candidate.0.pose.rotation;
+            let away = |k: &(Refined, Explained)| {
+                symmetry.angle_between(&k.0.pose.rotation, turn) > self.config.different
             };
-            if away(&best.pose) && others.iter().all(|o| away(&o.0.pose)) {
-                others.push(candidate);
+            if kept.iter().all(away) {
+                kept.push(candidate);
             }
         }
+        kept
+    }
+
+    /// The best pose with its belief against the different ones, or a refusal.
+    fn verdict(&self, different: &[(Refined, Explained)]) -> Result<ObjectPose, Refusal> {
+        let Some(((best, explained), others)) = different.split_first() else {
+            return Err(Refusal::NoAttitude);
+        };
         let odds = |e: &Explained| (e.evidence - explained.evidence).exp();
         let total = 1.0 + others.iter().map(|o| odds(&o.1)).sum::<f64>();
         let found = ObjectPose {
@@ -174,7 +204,7 @@ impl Search<'_> {
                 .map(|o| Alternative { pose: o.0.pose, confidence: odds(&o.1) / total })
                 .take(4)
                 .collect(),
-            symmetry,
+            symmetry: self.query.symmetry(),
         };
         if found.coverage < self.config.least_coverage {
             return Err(Refusal::TooFewEdges { best: Box::new(found) });
