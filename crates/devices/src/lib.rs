@@ -5,8 +5,10 @@
 //! or the simulator answers is a line in the configuration. All calls block and all are bounded in
 //! time. Times are of one clock per robot, see [`Clock`].
 
+pub mod clock;
 pub mod config;
 pub mod description;
+pub mod dynamixel;
 mod traits;
 
 pub use config::{Config, ConfigError};
