@@ -311,7 +311,9 @@ impl Maker<'_> {
         let top = height / 2.0;
         let room = self.room_above_housing(azimuth, height);
         let inside = height - self.assumed.wall - 0.004;
-        let depth = RIM_DEPTH.min(room).min(inside);
+        // Half way between holding too little of the wall and touching housing or bottom.
+        let balanced = |space: f64| (space + HOUSING_GAP + LEAST_CONTACT / 2.0) / 2.0;
+        let depth = RIM_DEPTH.min(balanced(room)).min(balanced(inside));
         if depth < LEAST_CONTACT || !self.no_handle(azimuth, Some(top - depth / 2.0)) {
             return None;
         }
@@ -335,7 +337,7 @@ impl Maker<'_> {
                 // A flat pad on a round wall keeps its hold while it meets it within its width.
                 across: g.width / 2.0,
                 closing: side,
-                approach: f64::min(depth - LEAST_CONTACT / 2.0, inside - depth + 0.004)
+                approach: f64::min(depth - LEAST_CONTACT / 2.0, inside - depth + HOUSING_GAP)
                     .min(room - depth + HOUSING_GAP)
                     .min(g.depth - depth),
             },
@@ -376,8 +378,7 @@ impl Maker<'_> {
             // No handle's middle is nearer to a landmark than both half widths together.
             let kept = ((self.assumed.housing + self.assumed.handle) / radius).min(1.0).asin();
             let off = azimuth - site.position[1].atan2(site.position[0]);
-            (off + PI).rem_euclid(TAU) - PI <= kept - taken
-                && (PI - off).rem_euclid(TAU) - PI <= kept - taken
+            ((off + PI).rem_euclid(TAU) - PI).abs() <= kept - taken
         };
         self.free.iter().any(inside)
             || (height.is_some() && self.record.landmarks.iter().any(by_housing))

@@ -4,8 +4,8 @@
 //! Out: `Ok` when every pair keeps its distance, else the pair that does not.
 //!
 //! Pairs that are tested: every moving body against every obstacle and fixed body, and moving bodies
-//! against each other. Neighbours (bodies of one joint, or of adjacent joints that already touch with
-//! all axes at zero) are left out: they are bolted together. Distances are those of `parry3d` between
+//! against each other. Neighbours (bodies of one joint, or of adjacent joints that meet with all axes
+//! at zero) are left out: a bearing joins them. Distances are those of `parry3d` between
 //! convex solids, after a test of bounding balls. A motion is tested at samples so dense that no point
 //! of the arm moves further than [`STEP`] between two of them; a clearance above half of that leaves
 //! no gap.
@@ -20,6 +20,9 @@ use crate::kinematics::Arm;
 
 /// Largest motion of any point of the arm between two tested samples (m).
 pub const STEP: f64 = 0.010;
+
+/// Bodies of adjacent joints that are nearer than this at zero meet in a bearing (m).
+const BOLTED: f64 = 0.025;
 
 /// Something solid that stands in the base frame.
 #[derive(Debug, Clone, PartialEq)]
@@ -143,7 +146,7 @@ impl RobotShape {
             for b in 0..a {
                 let (i, j) = (shape.parts[a].0.joints, shape.parts[b].0.joints);
                 let bolted =
-                    i.abs_diff(j) == 1 && at_zero[a].nearer_than(&at_zero[b], 1e-3).is_some();
+                    i.abs_diff(j) == 1 && at_zero[a].nearer_than(&at_zero[b], BOLTED).is_some();
                 if i != j && !bolted {
                     pairs.push((a, b));
                 }
@@ -262,13 +265,9 @@ impl RobotShape {
     }
 }
 
-/// `a + s (b - a)`.
+/// `(1 - s) a + s b`, exact at both ends.
 pub fn blend(a: &JointAngles, b: &JointAngles, s: f64) -> JointAngles {
-    let mut joints = *a;
-    for k in 0..6 {
-        joints[k] += s * (b[k] - a[k]);
-    }
-    joints
+    std::array::from_fn(|k| (1.0 - s) * a[k] + s * b[k])
 }
 
 /// 0..=steps, every eighth first, then the rest.
