@@ -17,7 +17,8 @@ pub const BONDS: usize = 8;
 
 /// Bytes that hold the longest item: a record, its key, and the rounding to a flash word.
 const ITEM: usize = MAX_BYTES + 64;
-const BOND_BYTES: usize = 16 + 7 + 16 + 1;
+/// Bytes of a stored bond.
+pub const BOND_BYTES: usize = 16 + 7 + 16 + 1;
 
 const RECORD_KEY: u8 = 0;
 const NEXT_BOND_KEY: u8 = 1;
@@ -112,7 +113,8 @@ impl<F: NorFlash> Store<F> {
     }
 }
 
-fn encode_bond(bond: &BondInformation) -> [u8; BOND_BYTES] {
+/// A bond as it is stored.
+pub fn encode_bond(bond: &BondInformation) -> [u8; BOND_BYTES] {
     let mut bytes = [0; BOND_BYTES];
     bytes[..16].copy_from_slice(&bond.ltk.to_le_bytes());
     bytes[16] = bond.identity.addr.kind.as_raw();
@@ -128,7 +130,8 @@ fn encode_bond(bond: &BondInformation) -> [u8; BOND_BYTES] {
     bytes
 }
 
-fn decode_bond(bytes: &[u8]) -> Option<BondInformation> {
+/// Reads a stored bond; `None` when it is none.
+pub fn decode_bond(bytes: &[u8]) -> Option<BondInformation> {
     let bytes: &[u8; BOND_BYTES] = bytes.try_into().ok()?;
     let (mut ltk, mut address, mut irk) = ([0; 16], [0; 6], [0; 16]);
     ltk.copy_from_slice(&bytes[..16]);

@@ -139,9 +139,18 @@ impl Controller {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct TransportError(ReadHciError<Infallible>);
 
+impl TransportError {
+    /// The stream has ended.
+    pub(crate) const CLOSED: TransportError =
+        TransportError(ReadHciError::Read(embedded_io::ReadExactError::UnexpectedEof));
+}
+
 impl fmt::Display for TransportError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "unreadable HCI packet: {}", self.0)
+        match *self {
+            TransportError::CLOSED => f.write_str("the connection to the controller has ended"),
+            TransportError(error) => write!(f, "unreadable HCI packet: {error}"),
+        }
     }
 }
 

@@ -114,6 +114,21 @@ impl Executor {
         }
     }
 
+    /// Runs everything for as long as a condition, asked whenever all tasks wait, holds.
+    pub fn run_while(&self, mut condition: impl FnMut() -> bool) -> Result<(), Stalled> {
+        loop {
+            self.run_ready();
+            if !condition() {
+                return Ok(());
+            }
+            let timer = time::next_timer();
+            if timer.is_none() && time::is_virtual() {
+                return Err(Stalled);
+            }
+            self.wait_until(timer);
+        }
+    }
+
     /// Runs everything until `future` is done.
     pub fn block_on<F: Future>(&self, future: F) -> Result<F::Output, Stalled> {
         let mut future = pin!(future);

@@ -20,9 +20,11 @@ mod executor;
 mod hci;
 mod link;
 mod medium;
+mod stream;
 pub mod time;
 
 pub use controller::{Controller, TransportError};
 pub use executor::{Executor, Stalled, TaskId};
 pub use link::{Fate, Fragment};
 pub use medium::{Air, AirConfig, DeviceId};
+pub use stream::{StreamTransport, serve};
