@@ -15,6 +15,8 @@ use std::sync::OnceLock;
 use std::task::Waker;
 use std::time::{Duration, Instant};
 
+// The stacks' wakers and cells need one implementation in the program: that of `std`.
+use critical_section as _;
 use embassy_time_driver::{Driver, TICK_HZ};
 
 /// Ticks are microseconds: `embassy-time`'s default rate.
