@@ -34,6 +34,8 @@ use crate::store::{BONDS, Store};
 
 /// How often the watchdog is fed.
 const FEEDING: Duration = Duration::from_secs(8);
+/// Time for the last packets of a link.
+const FAREWELL: Duration = Duration::from_millis(200);
 /// Wait after the first failed pairing; doubles with every further one.
 const FIRST_PENALTY: Duration = Duration::from_secs(1);
 /// Most doublings: 64 s.
@@ -247,7 +249,11 @@ impl<P: PacketPool, F: NorFlash, L: Lights, B: Battery, W: Watchdog> Tag<'_, '_,
                 watchdog.borrow_mut().feed();
                 match event {
                     GattConnectionEvent::Disconnected { .. } => return true,
-                    GattConnectionEvent::PairingFailed(_) => return false,
+                    GattConnectionEvent::PairingFailed(_) => {
+                        // The reason must reach the robot before the link ends.
+                        Timer::after(FAREWELL).await;
+                        return false;
+                    }
                     GattConnectionEvent::PairingComplete { bond: Some(bond), .. } => {
                         // A bond that is not kept costs the robot another pairing.
                         let _ = session.store.add_bond(&bond).await;

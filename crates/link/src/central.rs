@@ -501,7 +501,10 @@ impl<'a, C: Controller + ControllerCmdSync<LeSetScanParams>> Central<'a, '_, C> 
                 ConnectionEvent::PairingFailed(reason) => {
                     return Err(Fault::Refused(format!("pairing failed: {reason:?}")));
                 }
-                ConnectionEvent::Disconnected { .. } => return Err(Fault::Lost),
+                // Not tried again: the tag counts failed pairings and answers ever later.
+                ConnectionEvent::Disconnected { .. } => {
+                    return Err(Fault::Refused("pairing failed: the link ended".into()));
+                }
                 _ => {}
             }
         }
