@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use vergence::System;
 use vergence::report::{Report, TruthReport, numbers};
-use vergence_devices::{Config, Description};
+use vergence_devices::{Config, Description, Side};
 use vergence_geometry::Transform;
 use vergence_sim::{Scenario, Workcell};
 
@@ -48,6 +48,7 @@ impl RobotArgs {
         match &self.config {
             Some(path) => {
                 let (config, description) = read(path)?;
+                check_drivers(&config)?;
                 let workcell = Workcell::from_config(&config, &description, self.seed);
                 Opened::simulated(workcell.map_err(unusable)?)
             }
@@ -108,6 +109,22 @@ fn read(path: &Path) -> Result<(Config, Description), Failure> {
     Ok((config, description))
 }
 
+/// Refuses drivers that do not exist.
+fn check_drivers(config: &Config) -> Result<(), Failure> {
+    let heads = Side::BOTH.map(|side| config.head(side));
+    let named = heads
+        .iter()
+        .flat_map(|head| [&head.camera.driver, &head.servos.driver])
+        .chain([&config.radio.driver]);
+    match named.into_iter().find(|driver| *driver != "sim") {
+        None => Ok(()),
+        Some(driver) => Err(Failure::misuse(
+            format!("there is no driver \"{driver}\""),
+            "drivers are: sim (the simulated workcell, for all devices at once)",
+        )),
+    }
+}
+
 fn unusable(error: impl std::fmt::Display) -> Failure {
-    Failure::misuse(error, "compare with the workcell that is built in: `vergence sim --print`")
+    Failure::misuse(error, "compare with the workcell that is built in: `vergence workcell DIR`")
 }

@@ -22,6 +22,7 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 use vergence_geometry::{Camera, CameraError, Distortion};
 
+use crate::dynamixel::DynamixelConfig;
 use crate::traits::Side;
 
 /// Why a configuration was refused.
@@ -83,7 +84,7 @@ pub struct HeadConfig {
     /// The camera.
     pub camera: CameraConfig,
     /// The servos.
-    pub servos: DriverConfig,
+    pub servos: ServosConfig,
 }
 
 /// A camera's driver and its nominal lens.
@@ -107,6 +108,17 @@ pub struct CameraConfig {
     /// Distortion k1, k2, p1, p2, k3.
     #[serde(default)]
     pub distortion: [f64; 5],
+}
+
+/// The servos' driver; what only one driver needs stands in the table of its name.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ServosConfig {
+    /// Driver name.
+    pub driver: String,
+    /// For the driver `dynamixel`.
+    #[serde(default)]
+    pub dynamixel: Option<DynamixelConfig>,
 }
 
 /// A device that needs no more than a driver's name.

@@ -9,6 +9,7 @@
 pub mod edges;
 pub mod field;
 pub mod level;
+pub mod picture;
 pub mod refine;
 pub mod search;
 pub mod sites;
@@ -23,7 +24,7 @@ use field::Field;
 use level::{Level, Region};
 use refine::{EDGE_SD_PX, Pass, Refined};
 use search::{Search, Sight};
-use sites::Layout;
+use sites::{Layout, Site};
 use verdict::Explained;
 
 /// Settings of the directional method.
@@ -69,8 +70,29 @@ impl Default for Config {
     }
 }
 
+/// What a recognition saw on its way, for pictures.
+pub struct Trace<'a> {
+    /// The prepared views.
+    pub sights: Vec<Sight<'a>>,
+    /// The object's form.
+    pub model: Model,
+    /// Refined poses that differ, best first.
+    pub poses: Vec<Transform>,
+    /// The sites of the best pose.
+    pub sites: Vec<Site>,
+}
+
 /// The object's pose from the edges of one or more pictures, its rotation unknown.
 pub fn recognise(views: &[View], query: &Query, config: &Config) -> Result<ObjectPose, Refusal> {
+    recognise_traced(views, query, config).map_or_else(Err, |(result, _)| result)
+}
+
+/// [`recognise`] with what it saw, unless it could not even begin.
+pub fn recognise_traced<'a>(
+    views: &[View<'a>],
+    query: &Query,
+    config: &Config,
+) -> Result<(Result<ObjectPose, Refusal>, Trace<'a>), Refusal> {
     let (landmark, normal) = check(views, query)?;
     let model = Model::new(query.record);
     let sights = prepare(views, query, landmark, config);
@@ -79,13 +101,14 @@ pub fn recognise(views: &[View], query: &Query, config: &Config) -> Result<Objec
     }
     let search = Search { sights: &sights, model: &model, query, landmark, normal, config };
     let hypotheses = search.hypotheses();
-    if hypotheses.is_empty() {
-        return Err(Refusal::NoAttitude);
-    }
     let mut refined: Vec<(Refined, Explained)> =
         hypotheses.iter().map(|h| search.refine_and_weigh(&h.pose)).collect();
     refined.sort_by(|a, b| b.1.evidence.total_cmp(&a.1.evidence));
-    search.judge_best(&refined)
+    let different = search.different(refined);
+    let result = search.verdict(&different);
+    let poses = different.iter().map(|(r, _)| r.pose).collect();
+    let sites = different.into_iter().next().map(|(r, _)| r.sites).unwrap_or_default();
+    Ok((result, Trace { sights, model, poses, sites }))
 }
 
 /// Gradients, edges and fields of the views that can show the object.
@@ -144,31 +167,36 @@ impl Search<'_> {
         passes.push(last);
         let mut refined = self.refine(start, &passes);
         self.lay_out(&mut refined, &last);
-        let mut explained = verdict::weigh(&refined.sites, last.layout.range_px, 0.6);
+        let mut explained = verdict::weigh(&refined.sites, last.layout.range_px, 0.4);
         explained.evidence -= refined.strain;
         (refined, explained)
     }
 
-    /// The best pose with its belief against the different ones, or a refusal.
-    fn judge_best(&self, sorted: &[(Refined, Explained)]) -> Result<ObjectPose, Refusal> {
+    /// Of a list that is sorted best first, those that differ from every better one.
+    fn different(&self, sorted: Vec<(Refined, Explained)>) -> Vec<(Refined, Explained)> {
         let symmetry = self.query.symmetry();
-        let (best, explained) = sorted.first().ok_or(Refusal::NoAttitude)?;
-        let mut others: Vec<&(Refined, Explained)> = Vec::new();
-        for candidate in &sorted[1..] {
-            let away = |p: &Transform| {
-                symmetry.angle_between(&p.rotation, &candidate.0.pose.rotation) > self.config.different
+        let mut kept: Vec<(Refined, Explained)> = Vec::new();
+        for candidate in sorted {
+            let turn = &candidate.0.pose.rotation;
+            let away = |k: &(Refined, Explained)| {
+                symmetry.angle_between(&k.0.pose.rotation, turn) > self.config.different
             };
-            if away(&best.pose) && others.iter().all(|o| away(&o.0.pose)) {
-                others.push(candidate);
+            if kept.iter().all(away) {
+                kept.push(candidate);
             }
         }
+        kept
+    }
+
+    /// The best pose with its belief against the different ones, or a refusal.
+    fn verdict(&self, different: &[(Refined, Explained)]) -> Result<ObjectPose, Refusal> {
+        let Some(((best, explained), others)) = different.split_first() else {
+            return Err(Refusal::NoAttitude);
+        };
         let odds = |e: &Explained| (e.evidence - explained.evidence).exp();
         let total = 1.0 + others.iter().map(|o| odds(&o.1)).sum::<f64>();
         let found = ObjectPose {
-            pose: GaussianPose {
-                pose: best.pose,
-                covariance: best.covariance,
-            },
+            pose: GaussianPose { pose: best.pose, covariance: best.covariance },
             confidence: 1.0 / total,
             coverage: explained.coverage,
             alternatives: others
@@ -176,7 +204,7 @@ impl Search<'_> {
                 .map(|o| Alternative { pose: o.0.pose, confidence: odds(&o.1) / total })
                 .take(4)
                 .collect(),
-            symmetry,
+            symmetry: self.query.symmetry(),
         };
         if found.coverage < self.config.least_coverage {
             return Err(Refusal::TooFewEdges { best: Box::new(found) });
@@ -197,11 +225,31 @@ pub fn diagnose(views: &[View], query: &Query, config: &Config, truth: &Transfor
     let show = |name: &str, start: &Transform| {
         let (r, e) = search.refine_and_weigh(start);
         let d = vergence_geometry::gaussian::difference(truth, &r.pose);
-        println!("{name}: rot {:.2} deg pos {:.2} mm  ({:.2},{:.2},{:.2}) evidence {:.1} cov {:.2} scatter {:.2} own {:?} size {:.4} strain {:.1} sd {:.2}mm", d.fixed_rows::<3>(0).norm().to_degrees(), 1e3*d.fixed_rows::<3>(3).norm(), 1e3*d[3],1e3*d[4],1e3*d[5], e.evidence, e.coverage, e.scatter_px, r.nuisances.iter().map(|n| (n.0.z*100.0).round()/100.0).collect::<Vec<_>>(), r.log_size, r.strain, 1e3*(r.covariance[(3,3)]+r.covariance[(4,4)]+r.covariance[(5,5)]).sqrt());
+        println!(
+            "{name}: rot {:.2} deg pos {:.2} mm  ({:.2},{:.2},{:.2}) evidence {:.1} cov {:.2} scatter {:.2} own {:?} size {:.4} strain {:.1} sd {:.2}mm",
+            d.fixed_rows::<3>(0).norm().to_degrees(),
+            1e3 * d.fixed_rows::<3>(3).norm(),
+            1e3 * d[3],
+            1e3 * d[4],
+            1e3 * d[5],
+            e.evidence,
+            e.coverage,
+            e.scatter_px,
+            r.nuisances.iter().map(|n| (n.0.z * 100.0).round() / 100.0).collect::<Vec<_>>(),
+            r.log_size,
+            r.strain,
+            1e3 * (r.covariance[(3, 3)] + r.covariance[(4, 4)] + r.covariance[(5, 5)]).sqrt()
+        );
         r
     };
     for (i, s) in sights.iter().enumerate() {
-        println!("view {i} scale {} {}x{} noise {:.2}", s.coarse.scale, s.coarse.width(), s.coarse.height(), s.coarse.noise);
+        println!(
+            "view {i} scale {} {}x{} noise {:.2}",
+            s.coarse.scale,
+            s.coarse.width(),
+            s.coarse.height(),
+            s.coarse.noise
+        );
     }
     let r = show("from truth", truth);
     // residuals at truth
@@ -209,21 +257,58 @@ pub fn diagnose(views: &[View], query: &Query, config: &Config, truth: &Transfor
     for (v, s) in sights.iter().enumerate() {
         let mut out = Vec::new();
         let level = s.fine.as_ref().unwrap_or(&s.coarse);
-        sites::sites(&mut out, s, v, level, &model, &sites::State{pose: truth, log_size: 0.0, nuisance: Default::default()}, query.up, &layout);
-        
+        sites::sites(
+            &mut out,
+            s,
+            v,
+            level,
+            &model,
+            &sites::State { pose: truth, log_size: 0.0, nuisance: Default::default() },
+            query.up,
+            &layout,
+        );
+
         let mut by: std::collections::BTreeMap<usize, Vec<f64>> = Default::default();
         let mut all = Vec::new();
         for site in &out {
             let sign = 1.0;
-            if let Some(n) = site.edges().iter().map(|c| c.offset * sign).min_by(|a, b| a.abs().total_cmp(&b.abs())) {
-                if n.abs() < 1.5 { by.entry(site.segment).or_default().push(n); if site.kind == crate::Kind::Silhouette && !site.contact { all.push(n); } }
+            if let Some(n) = site
+                .edges()
+                .iter()
+                .map(|c| c.offset * sign)
+                .min_by(|a, b| a.abs().total_cmp(&b.abs()))
+            {
+                if n.abs() < 1.5 {
+                    by.entry(site.segment).or_default().push(n);
+                    if site.kind == crate::Kind::Silhouette && !site.contact {
+                        all.push(n);
+                    }
+                }
             }
         }
         all.sort_by(f64::total_cmp);
-        println!("view {v}: sites {} silhouette median outward {:.3} iqr {:.3}", out.len(), all.get(all.len()/2).unwrap_or(&f64::NAN), all.get(all.len()*3/4).unwrap_or(&f64::NAN) - all.get(all.len()/4).unwrap_or(&f64::NAN));
-        if by.len() < 12 { for (k, mut v) in by { v.sort_by(f64::total_cmp); let kind = out.iter().find(|s| s.segment == k).map(|s| s.kind); let c = out.iter().any(|s| s.segment == k && s.contact); print!("  seg {k} {kind:?} {c} n {} med {:.2};", v.len(), v[v.len()/2]); } println!(); }
+        println!(
+            "view {v}: sites {} silhouette median outward {:.3} iqr {:.3}",
+            out.len(),
+            all.get(all.len() / 2).unwrap_or(&f64::NAN),
+            all.get(all.len() * 3 / 4).unwrap_or(&f64::NAN)
+                - all.get(all.len() / 4).unwrap_or(&f64::NAN)
+        );
+        if by.len() < 12 {
+            for (k, mut v) in by {
+                v.sort_by(f64::total_cmp);
+                let kind = out.iter().find(|s| s.segment == k).map(|s| s.kind);
+                let c = out.iter().any(|s| s.segment == k && s.contact);
+                print!("  seg {k} {kind:?} {c} n {} med {:.2};", v.len(), v[v.len() / 2]);
+            }
+            println!();
+        }
     }
     let _ = r;
     let hypotheses = search.hypotheses();
-    for h in &hypotheses { let d = vergence_geometry::gaussian::difference(truth, &h.pose); print!("[start {:.1} deg ev {:.0}] ", d.fixed_rows::<3>(0).norm().to_degrees(), h.evidence); show("  hyp", &h.pose); }
+    for h in &hypotheses {
+        let d = vergence_geometry::gaussian::difference(truth, &h.pose);
+        print!("[start {:.1} deg ev {:.0}] ", d.fixed_rows::<3>(0).norm().to_degrees(), h.evidence);
+        show("  hyp", &h.pose);
+    }
 }

@@ -13,9 +13,10 @@
 //! always answers. Known weakness: the correlation is a mean over the template, so a small
 //! projection among many edges wins.
 
-use nalgebra::{Matrix3, Matrix6, Unit, UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, Matrix6, Point2, Point3, Unit, UnitQuaternion, Vector3};
 use vergence_geometry::{GaussianPose, Transform, gaussian::skew};
-use vergence_imaging::{Image, kernel};
+use vergence_imaging::canvas::colour::GREEN;
+use vergence_imaging::{Canvas, Image, kernel};
 
 use crate::model::{Contour, Model};
 use crate::types::{Alternative, ObjectPose, Query, Refusal, View, check};
@@ -75,6 +76,39 @@ pub fn stages(views: &[View], config: &Config) -> Stages {
         .collect();
     let fields = edges.iter().map(distance::transform).collect();
     Stages { edges, fields }
+}
+
+/// Pictures of steps 4 to 8 with the names of their files: edges, contour lines, template.
+pub fn draw(views: &[View], query: &Query, config: &Config) -> Vec<(String, Canvas)> {
+    let stages = stages(views, config);
+    let model = Model::bounding_box(query.record);
+    let found = recognise(views, query, config);
+    let mut out = Vec::new();
+    for (k, view) in views.iter().enumerate() {
+        out.push((format!("view{k}-1-edges"), Canvas::from_gray(&stages.edges[k], 2)));
+        let bright = |d: f32| (255.0 * (1.0 - d / (4.0 * config.reach_px))).clamp(0.0, 255.0) as u8;
+        let field = stages.fields[k].map(bright);
+        out.push((format!("view{k}-2-field"), Canvas::from_gray(&field, 2)));
+        let mut canvas = Canvas::from_gray(view.image, 2);
+        if let Ok(found) = &found {
+            for [from, to] in template(view, &model, &found.pose.pose) {
+                let at = |p: &nalgebra::Point2<f64>| (2.0 * p.x + 0.5, 2.0 * p.y + 0.5);
+                canvas.line(at(&from), at(&to), GREEN);
+            }
+        }
+        out.push((format!("view{k}-3-template"), canvas));
+    }
+    out
+}
+
+/// The visible lines of the model in a picture (px).
+fn template(view: &View, model: &Model, pose: &Transform) -> Vec<[Point2<f64>; 2]> {
+    let optical_from_object = view.base_from_optical.inv_mul(pose);
+    let eye = optical_from_object.inverse_transform_point(&Point3::origin());
+    let mut contour = Contour::new();
+    model.contour(&eye.coords, false, &mut contour);
+    let project = |p| view.camera.project(&(optical_from_object * Point3::from(p)));
+    contour.iter().filter_map(|s| Some([project(s.from)?, project(s.to)?])).collect()
 }
 
 /// The pose whose box template correlates best with the edges.
@@ -142,15 +176,8 @@ fn correlation(
     config: &Config,
 ) -> f64 {
     let (mut sum, mut points) = (0.0, 0usize);
-    let mut contour = Contour::new();
     for (view, field) in views.iter().zip(fields) {
-        let optical_from_object = view.base_from_optical.inv_mul(pose);
-        let eye = optical_from_object.inverse_transform_point(&nalgebra::Point3::origin());
-        model.contour(&eye.coords, false, &mut contour);
-        for segment in &contour {
-            let ends = [segment.from, segment.to]
-                .map(|p| view.camera.project(&(optical_from_object * nalgebra::Point3::from(p))));
-            let [Some(from), Some(to)] = ends else { continue };
+        for [from, to] in template(view, model, pose) {
             let n = ((to - from).norm() / config.step_px).ceil().max(1.0) as usize;
             points += n;
             for k in 0..n {

@@ -6,6 +6,7 @@ mod experiment;
 mod find;
 mod pose;
 mod tags;
+mod workcell;
 
 use clap::Subcommand;
 
@@ -20,6 +21,8 @@ pub enum Command {
     Tags(tags::Tags),
     /// Run one of the paper's experiments in the simulated workcell, with statistics.
     Experiment(experiment::Experiment),
+    /// Write the built-in workcell to a folder, to edit and use with --config.
+    Workcell(workcell::Workcell),
     /// Find blinking landmarks in a recording.
     Blink(blink::Args),
     /// Recognise objects of known size in a set of pictures.
@@ -32,6 +35,7 @@ pub fn run(command: Command) -> Result<bool, Failure> {
         Command::Find(args) => find::run(&args),
         Command::Tags(args) => tags::run(&args),
         Command::Experiment(args) => experiment::run(&args),
+        Command::Workcell(args) => workcell::run(&args),
         Command::Blink(args) => blink::run(args),
         Command::Pose(args) => pose::run(args),
     }

@@ -3,11 +3,12 @@
 mod set;
 mod table;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use clap::{Args, ValueEnum};
-use vergence_pose::{ObjectPose, Refusal, directional, paper};
+use vergence_imaging::codec;
+use vergence_pose::{ObjectPose, Query, Refusal, View, directional, paper};
 
 use crate::failure::Failure;
 use set::Scene;
@@ -26,6 +27,9 @@ pub struct PoseArgs {
     /// Scenes worked on at the same time; the times in the CSV are right only with one.
     #[arg(long, default_value_t = 1)]
     threads: usize,
+    /// Folder for pictures of what was seen: edges, field, best and second-best pose, residuals.
+    #[arg(long)]
+    save: Option<PathBuf>,
 }
 
 /// How to recognise.
@@ -68,7 +72,7 @@ pub fn run(args: PoseArgs) -> Result<bool, Failure> {
     Ok(outcomes.iter().any(|o| o.result.is_ok()))
 }
 
-fn recognise(id: u32, folder: &std::path::Path, args: &PoseArgs) -> Result<Outcome, Failure> {
+fn recognise(id: u32, folder: &Path, args: &PoseArgs) -> Result<Outcome, Failure> {
     let scene = Scene::read(folder)?;
     let (views, query) = (scene.views(), scene.query());
     let start = Instant::now();
@@ -79,6 +83,36 @@ fn recognise(id: u32, folder: &std::path::Path, args: &PoseArgs) -> Result<Outco
         }
     };
     let seconds = start.elapsed().as_secs_f64();
+    if let Some(folder) = &args.save {
+        save_pictures(folder, id, &views, &query, args.method)?;
+    }
     let base_from_left = views[0].base_from_optical;
     Ok(Outcome { id, object: scene.object, result, base_from_left, seconds })
+}
+
+/// Writes the pictures of one scene; the recognition runs once more, so that the time stays pure.
+fn save_pictures(
+    folder: &Path,
+    id: u32,
+    views: &[View],
+    query: &Query,
+    method: Method,
+) -> Result<(), Failure> {
+    let hint = "name a folder that can be written to";
+    std::fs::create_dir_all(folder)
+        .map_err(|e| Failure::misuse(format!("{}: {e}", folder.display()), hint))?;
+    let pictures = match method {
+        Method::Directional => {
+            match directional::recognise_traced(views, query, &directional::Config::default()) {
+                Ok((_, trace)) => directional::picture::draw(&trace),
+                Err(_) => Vec::new(),
+            }
+        }
+        Method::Paper => paper::draw(views, query, &paper::Config::default()),
+    };
+    for (name, canvas) in pictures {
+        let path = folder.join(format!("{id:06}-{name}.png"));
+        codec::write_canvas(&path, &canvas).map_err(|e| Failure::misuse(e, hint))?;
+    }
+    Ok(())
 }

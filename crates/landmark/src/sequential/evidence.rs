@@ -33,19 +33,46 @@ pub struct Series {
     pub noise: f64,
     /// Degrees of freedom left by the nuisances.
     pub freedom: f64,
+    /// Courses of the surroundings that were taken out as well (unit length).
+    pub local: Vec<Vec<f32>>,
 }
 
 impl Series {
     /// Prepares the brightness over time of one place.
-    pub fn new(raw: &[f32], nuisance: &Nuisance, noise: f64) -> Self {
+    pub fn new(raw: &[f32], nuisance: &Nuisance, local: Vec<Vec<f32>>, noise: f64) -> Self {
+        let taken = (nuisance.rank() + local.len()) as f64;
+        let freedom = (raw.len() as f64 - taken).max(1.0);
+        let mut series = Series { values: Vec::new(), energy: 0.0, noise, freedom, local };
         let mut values = raw.to_vec();
-        nuisance.remove(&mut values);
+        series.clear(nuisance, &mut values);
         if clip(&mut values) {
-            nuisance.remove(&mut values);
+            series.clear(nuisance, &mut values);
         }
-        let energy = f64::from(dot(&values, &values));
-        let freedom = (values.len() as f64 - nuisance.rank() as f64).max(1.0);
-        Series { energy, noise, freedom, values }
+        series.energy = f64::from(dot(&values, &values));
+        series.values = values;
+        series
+    }
+
+    /// Takes the nuisances of the picture and of this place out of a time course.
+    pub fn clear(&self, nuisance: &Nuisance, values: &mut [f32]) {
+        nuisance.remove(values);
+        for course in &self.local {
+            let share = dot(course, values);
+            values.iter_mut().zip(course).for_each(|(v, c)| *v -= share * c);
+        }
+    }
+
+    /// The light that a pattern at a phase and rate would give here, cleared of nuisances.
+    pub fn expect(
+        &self,
+        pattern: &Pattern,
+        times: &[(f64, f64)],
+        (phase, rate): (f64, f64),
+        nuisance: &Nuisance,
+        out: &mut Vec<f32>,
+    ) {
+        light(pattern, times, phase, rate, out);
+        self.clear(nuisance, out);
     }
 
     /// Energy with the prior's share added.
@@ -94,22 +121,44 @@ impl Evidence {
 /// an upper bound, and cheaper.
 pub fn weigh(series: &Series, bank: &Bank, floor: f64, scratch: &mut Vec<f32>) -> Option<Evidence> {
     bank.correlate(&series.values, scratch);
+    let kept = kept(series, bank);
+    // What the surroundings took from the expected light shortens it.
+    let share = |k: usize| kept.get(k).copied().unwrap_or(1.0);
+    for (k, c) in scratch.iter_mut().enumerate() {
+        *c /= share(k).sqrt();
+    }
     let best = (0..scratch.len()).max_by(|&a, &b| scratch[a].total_cmp(&scratch[b]))?;
-    let hypothesis = bank.hypotheses[best];
+    let scaled = |k: usize| {
+        let h = bank.hypotheses[k];
+        Hypothesis { norm2: h.norm2 * f64::from(share(k)), ..h }
+    };
     let correlation = f64::from(scratch[best]);
-    let bound = log_ratio(series, correlation, hypothesis.norm2);
-    let evidence = Evidence { log_ratio: bound, best: hypothesis, correlation };
+    let bound = log_ratio(series, correlation, scaled(best).norm2);
+    let evidence = Evidence { log_ratio: bound, best: scaled(best), correlation };
     if bound < floor {
         return Some(evidence);
     }
     let mut sum = 0.0;
-    for (c, h) in scratch.iter().zip(&bank.hypotheses) {
-        if *c > 0.0 {
-            sum += (log_ratio(series, f64::from(*c), h.norm2) - bound).exp();
-        }
+    for (k, c) in scratch.iter().enumerate().filter(|(_, c)| **c > 0.0) {
+        sum += (log_ratio(series, f64::from(*c), scaled(k).norm2) - bound).exp();
     }
     let log_ratio = bound + (sum / bank.hypotheses.len() as f64).ln();
     Some(Evidence { log_ratio, ..evidence })
+}
+
+/// Share of each hypothesis' light (squared length) that the surroundings leave; empty: all.
+fn kept(series: &Series, bank: &Bank) -> Vec<f32> {
+    if series.local.is_empty() {
+        return Vec::new();
+    }
+    let mut kept = vec![1.0f32; bank.hypotheses.len()];
+    let mut shares = Vec::new();
+    for course in &series.local {
+        bank.correlate(course, &mut shares);
+        kept.iter_mut().zip(&shares).for_each(|(k, s)| *k -= s * s);
+    }
+    // Below a tenth nothing trustworthy is left.
+    kept.iter().map(|k| if *k < 0.1 { f32::INFINITY } else { *k }).collect()
 }
 
 /// Log likelihood ratio of one phase and rate, amplitude and noise averaged over.
@@ -141,8 +190,7 @@ pub fn refine(
 ) -> Evidence {
     let mut expected = Vec::with_capacity(times.len());
     let mut at = |phase: f64| {
-        light(pattern, times, phase, start.best.rate, &mut expected);
-        nuisance.remove(&mut expected);
+        series.expect(pattern, times, (phase, start.best.rate), nuisance, &mut expected);
         let norm2 = f64::from(dot(&expected, &expected)).max(1e-9);
         let correlation = f64::from(dot(&expected, &series.values)) / norm2.sqrt();
         let best = Hypothesis { phase, norm2, ..start.best };

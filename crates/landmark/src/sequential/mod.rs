@@ -4,8 +4,8 @@
 //! or "not yet", after every frame. The method:
 //! 1. [`motion`]: registration of the background against the first frames; gain of every row;
 //! 2. [`front`]: a small matched filter on every frame, running mean and variance of its output;
-//! 3. [`scan`]: the pixels that vary most in each block, then the lines of each pattern's spectrum,
-//!    choose a few places;
+//! 3. [`scan`]: the pixels that vary more than their neighbours, then the lines of each pattern's
+//!    spectrum, choose a few places;
 //! 4. [`template`], [`nuisance`]: the light that a pattern would give, averaged over each exposure at
 //!    its time stamp, for all phases and clock rates; drift, motion and lamps projected out of both
 //!    sides;
@@ -24,6 +24,7 @@ pub mod motion;
 pub mod nuisance;
 pub mod scan;
 pub mod shift;
+pub mod surroundings;
 pub mod template;
 mod verdict;
 

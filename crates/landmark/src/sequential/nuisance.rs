@@ -119,7 +119,7 @@ fn lamps(history: &History) -> Vec<Vec<f32>> {
 
 /// The strongest common time course of the rows (unit length) and its strength in each: power
 /// iteration.
-fn strongest(table: &[f32], n: usize) -> Option<(Vec<f32>, Vec<f32>)> {
+pub fn strongest(table: &[f32], n: usize) -> Option<(Vec<f32>, Vec<f32>)> {
     let energy = |row: &&[f32]| dot(row, row);
     let start = table.chunks_exact(n).max_by(|a, b| energy(a).total_cmp(&energy(b)))?;
     let mut direction = start.to_vec();

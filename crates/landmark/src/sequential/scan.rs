@@ -1,8 +1,8 @@
 //! Which pixels deserve the full bank: energy first, then the lines of each pattern's spectrum.
 //!
 //! A light too weak to stand out of the noise in any single frame still varies a little more than its
-//! neighbours, and varies at its pattern's frequencies only. The picture is cut into blocks; the tenth
-//! of each block that varies most is tested for every pattern's lines; the best few places a pattern
+//! neighbours, and varies at its pattern's frequencies only. The pixels that vary more than their
+//! neighbours, about one in nine, are tested for every pattern's lines; the best few places a pattern
 //! go on. Choosing by rank, not by a threshold, keeps the cost constant and needs no noise model.
 
 use vergence_tag::Pattern;
@@ -14,9 +14,6 @@ use super::template::lines;
 
 /// Side of a block (px).
 pub const BLOCK: usize = 16;
-
-/// Pixels of a block that are tested for lines.
-const PER_BLOCK: usize = 24;
 
 /// Places a pattern that go on from a scan.
 const PER_PATTERN: usize = 24;
@@ -109,9 +106,10 @@ pub fn by_energy(
             if !exceeds(row, limit * variance) {
                 continue;
             }
+            let around = [y - 1, y, y + 1].map(|v| &energy[v * width..(v + 1) * width]);
             for x in from..to {
                 let here = energy[y * width + x];
-                if here > limit * variance && is_peak(energy, width, x, y) {
+                if here > limit * variance && is_peak(around, x) {
                     found.push((here / variance, (x, y)));
                 }
             }
@@ -133,10 +131,9 @@ fn exceeds(values: &[f32], limit: f32) -> bool {
     values.iter().fold(false, |any, v| any | (*v > limit))
 }
 
-fn is_peak(energy: &[f32], width: usize, x: usize, y: usize) -> bool {
-    let here = energy[y * width + x];
-    let around = [y - 1, y, y + 1].into_iter().flat_map(|v| (x - 1..=x + 1).map(move |u| (u, v)));
-    around.into_iter().all(|(u, v)| energy[v * width + u] <= here)
+fn is_peak(rows: [&[f32]; 3], x: usize) -> bool {
+    let here = rows[1][x];
+    rows.iter().all(|row| row[x - 1..=x + 1].iter().all(|v| *v <= here))
 }
 
 /// Tests the varying pixels for every pattern's lines; the best places a pattern, best first.
@@ -156,7 +153,7 @@ pub fn by_lines(
         .collect();
     let mut best: Vec<Vec<(f32, (usize, usize))>> = vec![Vec::new(); patterns.len()];
     let mut series = Vec::with_capacity(times.len());
-    for (x, y) in varying(energy, width, height) {
+    for (x, y) in peaks(energy, width, height) {
         history.series_at((x, y), &mut series);
         nuisance.remove(&mut series);
         let total = dot(&series, &series) + 40.0 * noise.at(x, y) as f32;
@@ -189,23 +186,18 @@ fn keep_best(list: &mut Vec<(f32, (usize, usize))>, score: f32, pixel: (usize, u
     list.truncate(PER_PATTERN);
 }
 
-/// The pixels of every block that vary most.
-fn varying(energy: &[f32], width: usize, height: usize) -> Vec<(usize, usize)> {
+/// The pixels that vary more than their eight neighbours, one in nine: an edge that sways is a ridge
+/// of many pixels but few peaks, and cannot crowd out a light.
+fn peaks(energy: &[f32], width: usize, height: usize) -> Vec<(usize, usize)> {
     let mut chosen = Vec::new();
-    let mut block: Vec<(f32, (usize, usize))> = Vec::with_capacity(BLOCK * BLOCK);
-    for y0 in (0..height).step_by(BLOCK) {
-        for x0 in (0..width).step_by(BLOCK) {
-            block.clear();
-            for y in y0.max(MARGIN)..(y0 + BLOCK).min(height - MARGIN) {
-                for x in x0.max(MARGIN)..(x0 + BLOCK).min(width - MARGIN) {
-                    block.push((energy[y * width + x], (x, y)));
-                }
+    for y in MARGIN..height - MARGIN {
+        let row = |y: usize| &energy[y * width..(y + 1) * width];
+        let (above, here, below) = (row(y - 1), row(y), row(y + 1));
+        for x in MARGIN..width - MARGIN {
+            let e = here[x];
+            if e >= here[x - 1] && e > here[x + 1] && is_peak([above, here, below], x) {
+                chosen.push((x, y));
             }
-            if block.len() > PER_BLOCK {
-                block.select_nth_unstable_by(PER_BLOCK, |a, b| b.0.total_cmp(&a.0));
-                block.truncate(PER_BLOCK);
-            }
-            chosen.extend(block.iter().map(|(_, pixel)| *pixel));
         }
     }
     chosen

@@ -20,7 +20,8 @@ use super::front::BLOB_VARIANCE;
 use super::history::History;
 use super::nuisance::{Nuisance, dot};
 use super::scan::{BlockNoise, Candidate, MARGIN};
-use super::template::{Bank, light, transitions};
+use super::surroundings::intruders;
+use super::template::{Bank, transitions};
 use crate::{Decision, Request, Sighting};
 
 /// Changes of the light that must have been seen: one more than a passing thing and its shadow make.
@@ -118,7 +119,7 @@ impl Round<'_> {
             let (x, y) = candidate.pixel;
             let place = Point2::new(x as f64, y as f64);
             self.history.series_at(candidate.pixel, &mut raw);
-            let series = Series::new(&raw, self.nuisance, self.noise.at(x, y));
+            let series = self.series_of(candidate, &raw);
             let range = candidate.request.map_or(0..self.requests.len(), |r| r..r + 1);
             for request in range {
                 let floor = self.presence() - 6.0;
@@ -133,6 +134,17 @@ impl Round<'_> {
             let sightings = self.sightings(request, seen, &mut banks);
             self.conclude(request, sightings, &mut decisions[request]);
         }
+    }
+
+    /// The series of a candidate; where it varies beyond the noise, what leaks in is taken out.
+    fn series_of(&self, candidate: &Candidate, raw: &[f32]) -> Series {
+        let noise = self.noise.at(candidate.pixel.0, candidate.pixel.1);
+        let plain = Series::new(raw, self.nuisance, Vec::new(), noise);
+        if plain.energy < NOISE_SLACK * noise * plain.freedom {
+            return plain;
+        }
+        let local = intruders(self.history, candidate.pixel, raw, self.nuisance, noise);
+        if local.is_empty() { plain } else { Series::new(raw, self.nuisance, local, noise) }
     }
 
     /// Sets one decision from the sightings of this round.
@@ -200,8 +212,8 @@ impl Round<'_> {
         let (mut raw, mut expected, mut scratch) = (Vec::new(), Vec::new(), Vec::new());
         for _ in 0..2 {
             evidence = refine(&series, pattern, &self.times, self.nuisance, evidence, step);
-            light(pattern, &self.times, evidence.best.phase, evidence.best.rate, &mut expected);
-            self.nuisance.remove(&mut expected);
+            let best = (evidence.best.phase, evidence.best.rate);
+            series.expect(pattern, &self.times, best, self.nuisance, &mut expected);
             let moved = self.peak(place, &expected, &mut raw);
             let (dx, dy) = (moved.x - seen.place.x, moved.y - seen.place.y);
             if dx.abs().max(dy.abs()) > 2.0 {
@@ -209,7 +221,8 @@ impl Round<'_> {
             }
             place = moved;
             self.history.series(place, &mut raw);
-            series = Series::new(&raw, self.nuisance, seen_noise(self, place));
+            let noise = self.noise.at(place.x as usize, place.y as usize);
+            series = Series::new(&raw, self.nuisance, series.local, noise);
             let again = weigh(&series, banks.get(request), self.presence() - 6.0, &mut scratch)?;
             evidence = again;
         }
@@ -298,9 +311,4 @@ impl Round<'_> {
         let (dx, dy) = self.history.mean_shift();
         Point2::new(place.x + dx, place.y + dy)
     }
-}
-
-/// Noise variance around a place (grey levels squared).
-fn seen_noise(round: &Round, place: Point2<f64>) -> f64 {
-    round.noise.at(place.x.max(0.0) as usize, place.y.max(0.0) as usize)
 }

@@ -24,13 +24,8 @@ pub struct Edgel {
 pub fn edgels(level: &Level) -> Vec<Edgel> {
     let (width, height) = (level.width(), level.height());
     let threshold2 = (NOISE_FACTOR * level.noise).powi(2);
-    let magnitude: Vec<f32> = level
-        .gx
-        .data()
-        .iter()
-        .zip(level.gy.data())
-        .map(|(gx, gy)| gx * gx + gy * gy)
-        .collect();
+    let magnitude: Vec<f32> =
+        level.gx.data().iter().zip(level.gy.data()).map(|(gx, gy)| gx * gx + gy * gy).collect();
     let mut out = Vec::new();
     for y in 1..height.saturating_sub(1) {
         for x in 1..width.saturating_sub(1) {

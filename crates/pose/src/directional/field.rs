@@ -150,9 +150,8 @@ impl Plane {
         if r1 < 0.0 || first >= self.rows || last < first {
             return (0.0, 0.0);
         }
-        let inside = |r: usize| {
-            usize::try_from(line + self.shift[r]).ok().filter(|&c| c < self.cols)
-        };
+        let inside =
+            |r: usize| usize::try_from(line + self.shift[r]).ok().filter(|&c| c < self.cols);
         let (Some(a), Some(b)) = (inside(first), inside(last)) else { return (0.0, 0.0) };
         let before = self.step_back(first, a as i32);
         let before = before.map_or(0, |c| self.integral[first * self.cols + c]);

@@ -12,8 +12,8 @@
 //! begins, is measured only coarsely.
 
 use nalgebra::{Matrix3, Matrix6, SMatrix, SVector, Vector3};
-use vergence_geometry::gaussian::{perturb, skew};
 use vergence_geometry::Transform;
+use vergence_geometry::gaussian::{perturb, skew};
 
 use super::search::Search;
 use super::sites::{Layout, Nuisance, Site, State, sites};
@@ -21,7 +21,7 @@ use crate::model::Kind;
 
 /// Standard deviation of an edge's place once the pose is right (px): aliasing, gamma, blooming and
 /// bent edges, not only noise.
-pub const EDGE_SD_PX: f64 = 0.35;
+pub const EDGE_SD_PX: f64 = 0.3;
 /// Neighbouring sites err alike: contour length (px) that counts as one independent measurement.
 pub const CORRELATION_PX: f64 = 4.0;
 /// Density of edges that have nothing to do with the contour (per px of normal).
@@ -39,16 +39,19 @@ pub fn absence(kind: Kind) -> f64 {
     }
 }
 
-/// Deviation of the foot's edge (px): contact shadows and rounded edges blur where it is.
-const CONTACT_SD_PX: f64 = 1.2;
+/// Deviation of an object's true form from its record (m): rounded edges, seams, bulging sides.
+const FORM_SD: f64 = 0.0006;
+/// Deviation of the foot's edge (m): contact shadows hide where the object ends.
+const CONTACT_SD: f64 = 0.002;
 /// Deviation of the swelling of silhouettes (px).
 const SWELL_SD_PX: f64 = 0.3;
-/// Deviation of the logarithm of the object's size: half a percent.
-const SIZE_SD: f64 = 0.005;
+/// Deviation of the logarithm of the object's size: one percent.
+const SIZE_SD: f64 = 0.01;
 
-/// Deviation of a site's edge when a pass works with `sd`.
-pub fn deviation(site: &Site, sd: f64) -> f64 {
-    if site.contact { sd.max(CONTACT_SD_PX) } else { sd }
+/// Deviation (px) of a site's edge when a pass works with `sd_px`.
+pub fn deviation(site: &Site, sd_px: f64) -> f64 {
+    let form = if site.contact { CONTACT_SD } else { FORM_SD };
+    sd_px.hypot(form * site.px_per_metre)
 }
 
 /// One pass of the refinement.
@@ -287,7 +290,6 @@ fn assign(site: &Site, shift: f64, sd: f64) -> Option<(f64, f64)> {
         return None;
     }
     let belief = total / (total + stray);
-    let sd_now = sd.max(EDGE_SD_PX);
-    let weight = belief * (site.length / CORRELATION_PX).min(1.0) / (sd_now * sd_now);
+    let weight = belief * (site.length / CORRELATION_PX).min(1.0) / (sd * sd);
     Some((weight, mean / total))
 }

@@ -53,6 +53,8 @@ pub struct Site {
     pub normal: (f64, f64),
     /// Contour length that the site stands for (picture px).
     pub length: f64,
+    /// Size of a metre across the line of sight there (px).
+    pub px_per_metre: f64,
     /// The foot of a standing object, where its shadow begins.
     pub contact: bool,
     /// Shift of the contour along the normal by the global unknowns (px per unit).
@@ -168,6 +170,7 @@ pub fn sites(
                 pixel: (pixel.x, pixel.y),
                 normal: (normal.x, normal.y),
                 length: length / n as f64,
+                px_per_metre: camera.fx / p.z,
                 contact,
                 by_pose,
                 by_nuisance: RowVector3::new(by_camera.x, by_camera.y, by_swell),
