@@ -7,6 +7,7 @@
 #![cfg_attr(not(feature = "std"), no_std)]
 
 pub mod cbor;
+pub mod codebook;
 pub mod pattern;
 pub mod record;
 
