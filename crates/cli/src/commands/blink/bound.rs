@@ -102,6 +102,8 @@ fn finder(requests: Vec<Request>) -> Result<SequentialFinder, Failure> {
         false_alarm: ALPHA * share,
         wrong_identity: ALPHA,
         window_frames: LONGEST,
+        // The question is which of sixteen: nothing else blinks.
+        foreign_rate: None,
         ..Config::default()
     };
     SequentialFinder::new(requests, config).map_err(|e| super::refused(&e))
