@@ -11,6 +11,7 @@ pub mod beacon;
 pub mod cbor;
 pub mod command;
 pub mod gatt;
+pub mod codebook;
 pub mod pattern;
 pub mod record;
 pub mod upload;
