@@ -315,6 +315,11 @@ mod tests {
 
     /// A camera at the origin that looks along +x, and a light at 1 m that faces it.
     fn frame_with(bodies: Vec<Body>, lit: bool) -> Image<f32> {
+        frame_at(bodies, if lit { 0.1 } else { 1.1 }, 0.0)
+    }
+
+    /// The light is on in the first second and dark in the next.
+    fn frame_at(bodies: Vec<Body>, start: f64, row_time: f64) -> Image<f32> {
         let emitter = Emitter {
             position: Point3::new(1.0, 0.05, -0.02),
             normal: Unit::new_normalize(Vector3::new(-1.0, 0.0, 0.0)),
@@ -331,14 +336,15 @@ mod tests {
         let pose = Transform::from_parts(Translation3::identity(), optical_from_body().inverse());
         let capture = Capture {
             sequence: 0,
-            start: if lit { 0.1 } else { 1.1 },
+            start,
             base_from_optical: [pose; 2],
             blinkers: vec![Blinker { emitter, plays: vec![play] }],
             stage: Arc::new(Stage::new(Scene { bodies, ..Scene::default() })),
         };
         let lens = Lens::centred(320, 240, 300.0);
         let light = LightSettings::default();
-        let mut sensor = Sensor::new(lens, CameraSettings::default(), &light, 1, 0);
+        let settings = CameraSettings { row_time, ..CameraSettings::default() };
+        let mut sensor = Sensor::new(lens, settings, &light, 1, 0);
         sensor.picture(&capture);
         sensor.expose(&capture)
     }
@@ -364,6 +370,16 @@ mod tests {
         // The wall's upper edge passes through the middle of the disc as the camera sees it.
         let half = total(&frame_with(vec![wall_at(0.99, -0.0198 - 0.05)], true));
         assert!(half > 0.2 * open && half < 0.8 * open, "half hidden: {half} of {open}");
+    }
+
+    #[test]
+    fn a_rolling_shutter_exposes_the_lights_row_later() {
+        // The light is seen in row 126; 0.1 ms a row, that is 12.6 ms after the first row.
+        let first_row = 0.992;
+        assert!(total(&frame_at(vec![], first_row, 0.0)) > 1.9, "whole exposure lit");
+        assert_eq!(total(&frame_at(vec![], first_row, 1e-4)), 0.0, "after the light went out");
+        let half = total(&frame_at(vec![], 0.998 - 0.012_55, 1e-4));
+        assert!((half - 1.0).abs() < 0.1, "goes out in the middle of the row's exposure: {half}");
     }
 
     #[test]
