@@ -9,9 +9,9 @@
 
 pub mod beacon;
 pub mod cbor;
+pub mod codebook;
 pub mod command;
 pub mod gatt;
-pub mod codebook;
 pub mod pattern;
 pub mod record;
 pub mod upload;
