@@ -34,7 +34,7 @@ const STANDING_LIMIT: f64 = 0.05;
 /// Probability that a visible contour shows no edge: occluded or without contrast.
 pub fn absence(kind: Kind) -> f64 {
     match kind {
-        Kind::Silhouette => 0.2,
+        Kind::Silhouette | Kind::Rim => 0.2,
         Kind::Crease => 0.45,
     }
 }
@@ -43,6 +43,8 @@ pub fn absence(kind: Kind) -> f64 {
 const LANDMARK_SD_PX: f64 = 0.3;
 /// Deviation of an object's true form from its record (m): rounded edges, seams, bulging sides.
 const FORM_SD: f64 = 0.0006;
+/// Deviation of the visible edge of an open rim (m): half a wall.
+const RIM_SD: f64 = 0.0015;
 /// Deviation of the foot's edge (m): contact shadows hide where the object ends.
 const CONTACT_SD: f64 = 0.002;
 /// Deviation of the swelling of silhouettes (px).
@@ -52,7 +54,11 @@ const SIZE_SD: f64 = 0.01;
 
 /// Deviation (px) of a site's edge when a pass works with `sd_px`.
 pub fn deviation(site: &Site, sd_px: f64) -> f64 {
-    let form = if site.contact { CONTACT_SD } else { FORM_SD };
+    let form = match site.kind {
+        _ if site.contact => CONTACT_SD,
+        Kind::Rim => RIM_SD,
+        _ => FORM_SD,
+    };
     sd_px.hypot(form * site.px_per_metre)
 }
 
@@ -65,6 +71,13 @@ pub struct Pass {
     pub layout: Layout,
     /// At full resolution instead of the working scale.
     pub fine: bool,
+}
+
+impl Pass {
+    /// A pass from its numbers: deviation, range to either side, spacing of sites (picture px).
+    pub fn new(sd_px: f64, range_px: f64, spacing_px: f64, fine: bool) -> Self {
+        Pass { sd_px, layout: Layout { spacing_px, range_px }, fine }
+    }
 }
 
 /// A refined pose.
@@ -105,30 +118,21 @@ struct Move {
 }
 
 impl Search<'_> {
-    /// Refines a pose through the given passes.
-    pub fn refine(&self, start: &Transform, passes: &[Pass]) -> Refined {
+    /// Refines a state through the given passes.
+    pub fn refine(&self, refined: &mut Refined, passes: &[Pass]) {
         let views = self.sights.len();
-        let mut refined = Refined {
-            pose: *start,
-            log_size: 0.0,
-            nuisances: vec![Nuisance::default(); views],
-            covariance: Matrix6::identity(),
-            strain: 0.0,
-            sites: Vec::new(),
-        };
         for pass in passes {
-            self.lay_out(&mut refined, pass);
+            self.lay_out(refined, pass);
             // Two steps on the same sites: the assignments settle while the geometry is linear.
             let mut moved = Move { shared: Vector7::zeros(), own: vec![Vector3::zeros(); views] };
             for _ in 0..2 {
-                let Some(step) = self.step(&mut refined, pass, &moved) else { break };
+                let Some(step) = self.step(refined, pass, &moved) else { break };
                 moved.shared += step.shared;
                 moved.own.iter_mut().zip(step.own).for_each(|(m, s)| *m += s);
             }
             refined.apply(&moved);
         }
-        refined.strain = self.strain(&refined);
-        refined
+        refined.strain = self.strain(refined);
     }
 
     /// Looks for the edges around a refined pose anew.
@@ -319,6 +323,18 @@ impl Search<'_> {
 }
 
 impl Refined {
+    /// A pose not yet refined.
+    pub fn new(pose: &Transform, views: usize) -> Self {
+        Refined {
+            pose: *pose,
+            log_size: 0.0,
+            nuisances: vec![Nuisance::default(); views],
+            covariance: Matrix6::identity(),
+            strain: 0.0,
+            sites: Vec::new(),
+        }
+    }
+
     fn apply(&mut self, moved: &Move) {
         self.pose = perturb(&self.pose, &moved.shared.fixed_rows::<6>(0).into_owned());
         self.log_size += moved.shared[6];
