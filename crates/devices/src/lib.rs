@@ -9,6 +9,7 @@ pub mod clock;
 pub mod config;
 pub mod description;
 pub mod dynamixel;
+pub mod mjpeg;
 mod traits;
 
 pub use config::{Config, ConfigError};

@@ -154,9 +154,7 @@ pub fn evaluate_kind(kind: &ServoKind, config: &EvaluationConfig) -> ServoFigure
         };
         let calibration = calibrate(&world.nominal, &session.places, &session.lengths, &settings);
         let share = config.placements / heads + usize::from(h < config.placements % heads);
-        if let Err(e) = &calibration {
-            eprintln!("DBG {e}");
-        }
+        if let Err(e) = &calibration {}
         let Ok(calibration) = calibration else {
             sums.refused_calibrations += 1;
             continue;
@@ -401,7 +399,6 @@ impl World {
         let error =
             (point - middle(&calibration.heads)).norm() - (light - middle(&self.truth)).norm();
         let Some(sigma) = calibration.distance_sigma(&point) else { return };
-        eprintln!("DBG sys {:.2} mm predicted {:.2}", error * 1e3, sigma * 1e3);
         sums.covered.push(f64::from(u8::from(error.abs() <= 1.96 * sigma)));
     }
 
@@ -421,7 +418,6 @@ impl World {
                     let off = predicted - seen.pixel;
                     if off.norm() > 5.0 {
                         eprintln!(
-                            "DBG off {off} light {light} found {found} head {k} n {:?}",
                             session
                                 .places
                                 .iter()

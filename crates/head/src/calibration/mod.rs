@@ -249,13 +249,17 @@ pub fn calibrate(
     if !missing.is_empty() {
         return Err(CalibrateError::Unconstrained { missing, distance_sigma: f64::INFINITY });
     }
-    let lights = places.iter().map(|place| first_guess(nominal, place)).collect();
     let problem = solver::Problem { nominal, places, lengths, config };
-    let Some(solution) = problem.solve(lights) else {
+    // Three degrees are as much as the heads' vergence at 1 m, so where the rays of the description
+    // meet may mislead; the usual distances are tried first.
+    let starts = FIRST_DISTANCES
+        .into_iter()
+        .map(|distance| places.iter().map(|place| first_guess(nominal, place, distance)).collect());
+    let Some(solution) = problem.solve(starts) else {
         return Err(CalibrateError::NoFit { rms_px: f64::INFINITY });
     };
-    // Pixels that miss by many times what the noise explains are another head, not this one.
-    if solution.chi2_median > 9.0 {
+    // Sightings that miss by more than the noise explains are another head, not this one.
+    if solution.chi2_mean > solver::EXPLAINED {
         return Err(CalibrateError::NoFit { rms_px: solution.rms_px });
     }
     let calibration = Calibration {
@@ -385,8 +389,15 @@ fn check(places: &[LightPlace], lengths: &[KnownLength]) -> Result<(), Calibrate
     Ok(())
 }
 
-/// A place for the light to start from: nearest to all rays, in front and within arm's reach or so.
-fn first_guess(heads: &[PanTiltHead; 2], place: &LightPlace) -> Point3<f64> {
+/// Distances (m) at which the lights start; `None` for where their rays meet.
+const FIRST_DISTANCES: [Option<f64>; 4] = [Some(1.0), None, Some(0.6), Some(1.8)];
+
+/// A place for the light to start from: along the mean ray, at the given distance or where the rays
+/// meet, in front and within arm's reach or so.
+fn first_guess(heads: &[PanTiltHead; 2], place: &LightPlace, distance: Option<f64>) -> Point3<f64> {
+    if let Some((position, _)) = place.known {
+        return position;
+    }
     let rays: Vec<_> = (0..2)
         .flat_map(|k| place.fixations[k].iter().map(move |f| (k, f)))
         .map(|(k, f)| heads[k].ray(f.angles, &f.pixel))
@@ -394,6 +405,7 @@ fn first_guess(heads: &[PanTiltHead; 2], place: &LightPlace) -> Point3<f64> {
     let mean: Vector3<f64> = rays.iter().map(|r| r.direction.into_inner()).sum();
     let direction = mean.try_normalize(1e-9).unwrap_or_else(Vector3::x);
     let from = middle(heads);
-    let distance = nearest_to_rays(&rays).map_or(1.0, |p| (p - from).dot(&direction));
+    let met = || nearest_to_rays(&rays).map_or(1.0, |p| (p - from).dot(&direction));
+    let distance = distance.unwrap_or_else(met);
     from + direction * distance.clamp(0.3, 3.0)
 }

@@ -14,6 +14,8 @@ const CAUCHY: [f64; 3] = [1000.0, 30.0, 4.0];
 const LOOSE_LENGTH: [f64; 3] = [1.0, 0.02, 0.0];
 /// A sighting that is off by more sigmas counts as wrong.
 const OUTLIER: f64 = 6.0;
+/// Mean chi-squared of a sighting (2 when the noise is as stated) up to which a solution explains them.
+pub(super) const EXPLAINED: f64 = 4.0;
 const MAX_ITERATIONS: usize = 60;
 
 pub(super) struct Problem<'a> {
@@ -29,8 +31,8 @@ pub(super) struct Solution {
     pub covariance: DMatrix<f64>,
     pub rms_px: f64,
     pub outliers: f64,
-    /// Median of the sightings' chi-squared.
-    pub chi2_median: f64,
+    /// Mean of the sightings' chi-squared (two degrees of freedom), wrong ones capped.
+    pub chi2_mean: f64,
 }
 
 #[derive(Clone)]
@@ -57,7 +59,24 @@ struct Row {
 }
 
 impl Problem<'_> {
-    pub(super) fn solve(&self, lights: Vec<Point3<f64>>) -> Option<Solution> {
+    /// Solves from each of several first guesses of the lights until one explains the sightings.
+    pub(super) fn solve(&self, starts: impl Iterator<Item = Vec<Point3<f64>>>) -> Option<Solution> {
+        let mut best: Option<Solution> = None;
+        for lights in starts {
+            let solution = self.solve_from(lights);
+            if let Some(solution) = solution
+                && best.as_ref().is_none_or(|b| solution.chi2_mean < b.chi2_mean)
+            {
+                best = Some(solution);
+            }
+            if best.as_ref().is_some_and(|b| b.chi2_mean < EXPLAINED && b.outliers < 0.05) {
+                break;
+            }
+        }
+        best
+    }
+
+    fn solve_from(&self, lights: Vec<Point3<f64>>) -> Option<Solution> {
         let mut state =
             State { heads: self.nominal.clone(), moved: [HeadVector::zeros(); 2], lights };
         let mut normal = None;
@@ -79,7 +98,7 @@ impl Problem<'_> {
         for (i, mut values) in chi2.into_iter().enumerate() {
             values.sort_by(f64::total_cmp);
             if values.get(values.len() / 2).is_some_and(|&median| median > OUTLIER * OUTLIER) {
-                state.lights[i] = super::first_guess(&state.heads, &self.places[i]);
+                state.lights[i] = super::first_guess(&state.heads, &self.places[i], None);
             }
         }
         Some(())
@@ -117,18 +136,20 @@ impl Problem<'_> {
     fn finish(&self, state: State, normal: Normal) -> Option<Solution> {
         let covariance =
             normal.information.cholesky()?.inverse().view((0, 0), (BOTH, BOTH)).into_owned();
-        let (mut chi2, mut squares, mut counted) = (Vec::new(), 0.0, 0usize);
+        let (mut count, mut chi2) = (0usize, 0.0);
+        let (mut squares, mut counted) = (0.0, 0usize);
         self.for_each_row(&state, |_, _, row| {
-            chi2.push(row.chi2);
+            count += 1;
+            // Capped, so that a few wrong sightings do not hide that all others fit.
+            chi2 += row.chi2.min(OUTLIER * OUTLIER);
             if row.chi2 < OUTLIER * OUTLIER {
                 squares += row.residual.norm_squared();
                 counted += 2;
             }
         })?;
-        chi2.sort_by(f64::total_cmp);
         Some(Solution {
-            chi2_median: chi2.get(chi2.len() / 2).copied()?,
-            outliers: 1.0 - counted as f64 / 2.0 / chi2.len() as f64,
+            chi2_mean: chi2 / count.max(1) as f64,
+            outliers: 1.0 - counted as f64 / 2.0 / count.max(1) as f64,
             rms_px: (squares / counted.max(1) as f64).sqrt(),
             covariance,
             heads: state.heads,
