@@ -6,6 +6,10 @@
 
 mod commands;
 mod failure;
+mod output;
+mod progress;
+mod robot;
+mod save;
 
 use std::process::ExitCode;
 

@@ -41,6 +41,12 @@ pub enum DescriptionError {
     /// A joint that is not revolute, or has no axis.
     #[error("joint \"{0}\" is neither fixed nor revolute with an axis")]
     Joint(String),
+    /// A collision shape that is neither box, cylinder nor sphere, or has no size.
+    #[error("link \"{0}\": collision shapes must be boxes, cylinders or spheres")]
+    Shape(String),
+    /// The hand does not carry two opposite fingers.
+    #[error("link \"{0}\" does not carry two prismatic fingers that move against each other")]
+    NoGripper(String),
 }
 
 /// A parsed URDF.

@@ -79,6 +79,10 @@ pub trait PanTilt: Send {
     fn read(&mut self) -> Result<JointReading, DeviceError>;
     /// Smallest angle that the encoders resolve (rad).
     fn resolution(&self) -> f64;
+    /// Slack of the gears that the encoders do not see (rad); zero when none is known.
+    fn backlash(&self) -> f64 {
+        0.0
+    }
 }
 
 /// Address of a tag on the radio; opaque bytes.

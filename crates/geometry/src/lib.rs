@@ -18,13 +18,17 @@ pub mod camera;
 pub mod chain;
 pub mod gaussian;
 pub mod ray;
+pub mod solid;
 pub mod symmetry;
+pub mod trajectory;
 
 pub use camera::{Camera, CameraError, Distortion};
 pub use chain::{Chain, Joint, Limits};
 pub use gaussian::{GaussianPoint, GaussianPose};
 pub use ray::Ray;
+pub use solid::{Body, Solid};
 pub use symmetry::Symmetry;
+pub use trajectory::{JointAngles, Trajectory, Waypoint};
 
 /// A rigid transform. `a_from_b * p_b` gives `p_a`.
 pub type Transform = nalgebra::Isometry3<f64>;

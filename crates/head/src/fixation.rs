@@ -78,7 +78,7 @@ impl Fixator {
             return NextMove::Hold;
         }
         self.moves += 1;
-        NextMove::Go { via: approach(head, angles, goal, self.config.backlash), goal }
+        NextMove::Go { via: approach(head, angles, goal, &self.config), goal }
     }
 
     /// Moves planned so far.
@@ -93,10 +93,11 @@ fn approach(
     head: &PanTiltHead,
     angles: [f64; 2],
     goal: [f64; 2],
-    backlash: f64,
+    config: &FixatorConfig,
 ) -> Option<[f64; 2]> {
-    let run_up = 1.5 * backlash;
-    if run_up <= 0.0 || (0..2).all(|k| goal[k] - angles[k] >= run_up) {
+    // Servos round both the waypoint and the goal to their steps: one step more keeps them apart.
+    let run_up = 1.5 * config.backlash + config.resolution;
+    if config.backlash <= 0.0 || (0..2).all(|k| goal[k] - angles[k] >= run_up) {
         return None;
     }
     let via = [0, 1].map(|k| match goal[k] - angles[k] >= run_up {

@@ -2,19 +2,27 @@
 //!
 //! Shared by the robot and the firmware, therefore `no_std` and without a heap: strings and lists
 //! have fixed capacities. [`Record`] is Table 1 of the paper and a little more; [`cbor`] is its wire
-//! form (RFC 8949, schema in `docs/record.cddl`); [`Pattern`] is what the LED plays. With the
-//! feature `std` (default) the record also reads and writes as JSON or TOML through serde.
+//! form (RFC 8949, schema in `docs/record.cddl`); [`Pattern`] is what the LED plays, [`Command`] how
+//! it is told, [`gatt`] where on the tag's Bluetooth server, [`Upload`] how a new record gets there,
+//! and [`Beacon`] what the tag says of itself to everybody. With the feature `std` (default) the record also reads and writes as JSON or TOML through serde.
 #![cfg_attr(not(feature = "std"), no_std)]
 
+pub mod beacon;
 pub mod cbor;
+pub mod command;
+pub mod gatt;
 pub mod pattern;
 pub mod record;
+pub mod upload;
 
+pub use beacon::Beacon;
 pub use cbor::RecordError;
+pub use command::{Command, CommandError, State};
 pub use pattern::{Pattern, PatternError};
 pub use record::{
     BoundingBox, Invalid, LandmarkSite, Mobility, Physical, Record, Semantic, Shape, Text,
 };
+pub use upload::Upload;
 
 /// A position, direction or pair in the object frame as plain numbers (m).
 pub type Vec3 = [f64; 3];

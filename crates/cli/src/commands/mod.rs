@@ -1,15 +1,42 @@
 //! One module a command: its arguments and what it does. Adding a command is a module here, a
 //! variant of [`Command`] and a line in [`run`].
 
+mod blink;
+mod experiment;
+mod find;
+mod pose;
+mod tags;
+mod workcell;
+
 use clap::Subcommand;
 
 use crate::failure::Failure;
 
 /// What the program can do.
 #[derive(Subcommand)]
-pub enum Command {}
+pub enum Command {
+    /// Find an object and recognise its pose.
+    Find(find::Find),
+    /// List the tags in radio range with their records.
+    Tags(tags::Tags),
+    /// Run one of the paper's experiments in the simulated workcell, with statistics.
+    Experiment(experiment::Experiment),
+    /// Write the built-in workcell to a folder, to edit and use with --config.
+    Workcell(workcell::Workcell),
+    /// Find blinking landmarks in a recording.
+    Blink(blink::Args),
+    /// Recognise objects of known size in a set of pictures.
+    Pose(pose::PoseArgs),
+}
 
 /// Runs a command; `true` when the thing asked for was achieved.
 pub fn run(command: Command) -> Result<bool, Failure> {
-    match command {}
+    match command {
+        Command::Find(args) => find::run(&args),
+        Command::Tags(args) => tags::run(&args),
+        Command::Experiment(args) => experiment::run(&args),
+        Command::Workcell(args) => workcell::run(&args),
+        Command::Blink(args) => blink::run(args),
+        Command::Pose(args) => pose::run(args),
+    }
 }

@@ -1,0 +1,137 @@
+//! `vergence blink`: which of the requested tags blink in a recording, and where.
+//!
+//! In: a ROS 2 recording of one camera and a request (JSON: the patterns, the chip durations, the
+//! clock tolerance, the exposure). Out: JSON with one detection for every tag that is seen.
+
+mod recording;
+mod report;
+mod request;
+
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use vergence_landmark::{Finder, FinderError, paper, sequential};
+
+use self::report::Report;
+use self::request::BlinkRequest;
+use crate::failure::Failure;
+
+/// How the landmarks are looked for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Method {
+    /// The on/off difference with projection histograms of the 2005 paper.
+    Paper,
+    /// Soft evidence weighed frame by frame, with a stated rate of false alarms.
+    Sequential,
+}
+
+/// Find blinking landmarks in a recording.
+#[derive(clap::Args)]
+pub struct Args {
+    /// A ROS 2 recording (MCAP) with the images of one camera
+    #[arg(required_unless_present = "episodes", requires = "request")]
+    recording: Option<PathBuf>,
+    /// What to look for (JSON)
+    #[arg(long)]
+    request: Option<PathBuf>,
+    /// A folder of episodes, each a folder with recording.mcap and request.json; needs --out DIR
+    #[arg(long, conflicts_with_all = ["recording", "request"], requires = "out")]
+    episodes: Option<PathBuf>,
+    /// How to look
+    #[arg(long, value_enum, default_value = "sequential")]
+    method: Method,
+    /// Print one JSON document instead of text
+    #[arg(long)]
+    json: bool,
+    /// Write the JSON to this file (with --episodes: one file an episode in this folder)
+    #[arg(long)]
+    out: Option<PathBuf>,
+}
+
+/// Runs the command; `true` when every requested tag is decided.
+pub fn run(args: Args) -> Result<bool, Failure> {
+    if let (Some(set), Some(out)) = (&args.episodes, &args.out) {
+        return run_set(set, out, args.method);
+    }
+    let (Some(recording), Some(request)) = (&args.recording, &args.request) else {
+        return Err(Failure::misuse("no recording given", "name a recording and --request FILE"));
+    };
+    let report = look(recording, request, args.method)?;
+    if let Some(out) = &args.out {
+        write(out, &report.json())?;
+    }
+    if args.json {
+        println!("{}", report.json());
+    } else {
+        print!("{}", report.text());
+    }
+    Ok(report.is_complete())
+}
+
+/// Every episode of a folder; the answers go to `<out>/<episode>.json`.
+fn run_set(set: &Path, out: &Path, method: Method) -> Result<bool, Failure> {
+    let unreadable = |e| Failure::misuse(format!("{}: {e}", set.display()), "name a folder");
+    let mut episodes: Vec<PathBuf> = std::fs::read_dir(set)
+        .map_err(unreadable)?
+        .filter_map(|entry| entry.ok().map(|e| e.path()))
+        .filter(|path| path.join("request.json").is_file())
+        .collect();
+    episodes.sort();
+    if episodes.is_empty() {
+        let message = format!("{}: no episode in it", set.display());
+        return Err(Failure::misuse(message, "an episode is a folder with a request.json"));
+    }
+    std::fs::create_dir_all(out).map_err(|e| {
+        Failure::failed(format!("{}: {e}", out.display()), "name a folder that can be written")
+    })?;
+    for episode in episodes {
+        let report = look(&episode.join("recording.mcap"), &episode.join("request.json"), method)?;
+        let name = episode.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        eprintln!("{name}: {}", report.line());
+        write(&out.join(name).with_extension("json"), &report.json())?;
+    }
+    Ok(true)
+}
+
+fn write(path: &Path, text: &str) -> Result<(), Failure> {
+    std::fs::write(path, text).map_err(|e| {
+        Failure::failed(format!("{}: {e}", path.display()), "name a file that can be written")
+    })
+}
+
+/// Looks through one recording.
+fn look(recording: &Path, request: &Path, method: Method) -> Result<Report, Failure> {
+    let request = BlinkRequest::read(request)?;
+    let mut finder: Box<dyn Finder> = match method {
+        Method::Paper => {
+            let finder = paper::PaperFinder::new(request.requests()?, paper::Config::default());
+            Box::new(finder.map_err(|e| refused(&e))?)
+        }
+        Method::Sequential => {
+            let config = sequential::Config::default();
+            let finder = sequential::SequentialFinder::new(request.requests()?, config);
+            Box::new(finder.map_err(|e| refused(&e))?)
+        }
+    };
+    let started = Instant::now();
+    let (mut frames, mut first) = (0, None);
+    for frame in recording::frames(recording, &request.camera)? {
+        let mut frame = frame?;
+        frame.exposure = request.exposure();
+        frame.row_time = request.row_time();
+        first.get_or_insert(frame.stamp);
+        finder.push(&frame).map_err(|e| refused(&e))?;
+        frames += 1;
+    }
+    finder.finish();
+    let Some(first) = first else {
+        let message = format!("{}: no image on `{}`", recording.display(), request.camera);
+        return Err(Failure::misuse(message, "name the image topic as `camera` in the request"));
+    };
+    let seconds = started.elapsed().as_secs_f64();
+    Ok(Report::new(&request, finder.decisions(), first, frames, seconds))
+}
+
+fn refused(error: &FinderError) -> Failure {
+    Failure::misuse(error, "correct the request or the recording")
+}

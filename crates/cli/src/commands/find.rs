@@ -1,0 +1,103 @@
+//! `vergence find`: an object's name in, its pose in the robot's base frame out.
+
+use std::path::PathBuf;
+
+use clap::{Args, ValueEnum};
+use vergence::{FindConfig, Method, Report};
+
+use crate::failure::Failure;
+use crate::progress::Progress;
+use crate::robot::{Errors, RobotArgs};
+use crate::save::Saver;
+
+/// Find an object and recognise its pose (steps 1 to 9 of the paper).
+#[derive(Args)]
+pub struct Find {
+    /// Object id, as the tag advertises it.
+    object: String,
+    #[command(flatten)]
+    robot: RobotArgs,
+    /// Which recognition is used.
+    #[arg(long, value_enum, default_value_t)]
+    method: MethodArg,
+    /// Folder for the picture of every step and `recording.mcap`.
+    #[arg(long, value_name = "DIR")]
+    save: Option<PathBuf>,
+    /// Print the result as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+/// `--method` as it is written on the command line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
+pub enum MethodArg {
+    /// The 2005 paper as published.
+    Paper,
+    /// Coded light, directional distance fields, joint refinement.
+    #[default]
+    Directional,
+}
+
+impl From<MethodArg> for Method {
+    fn from(arg: MethodArg) -> Self {
+        match arg {
+            MethodArg::Paper => Method::Paper,
+            MethodArg::Directional => Method::Directional,
+        }
+    }
+}
+
+/// Runs the command.
+pub fn run(args: &Find) -> Result<bool, Failure> {
+    let mut robot = args.robot.open()?;
+    let config =
+        FindConfig { method: args.method.into(), seed: args.robot.seed, ..FindConfig::default() };
+    let saver = args.save.as_deref().map(|dir| Saver::create(dir, &robot)).transpose()?;
+    let mut observer = (Progress::steps(), saver);
+    let mut report = vergence::find(&mut robot.system, &args.object, &config, &mut observer);
+    report.truth = robot.truth(&args.object);
+    let (progress, saver) = observer;
+    drop(progress);
+    if let Some(saver) = saver {
+        saver.finish(&report)?;
+    }
+    print(args, &report)?;
+    Ok(report.found)
+}
+
+fn print(args: &Find, report: &Report) -> Result<(), Failure> {
+    if args.json {
+        return crate::output::json(report);
+    }
+    if let Some(reason) = &report.reason {
+        println!("{}: not found: {reason}", report.object_id);
+        println!("  what to do: {}", report.hint.unwrap_or_default());
+    }
+    if let Some(landmark) = &report.landmark {
+        let [x, y, z] = landmark.position;
+        let sigma = [0, 4, 8].map(|k| 1e3 * landmark.covariance[k].sqrt());
+        println!(
+            "landmark  x {x:.4}  y {y:.4}  z {z:.4} m  (+- {:.1}, {:.1}, {:.1} mm)",
+            sigma[0], sigma[1], sigma[2]
+        );
+    }
+    if let Some(pose) = &report.pose {
+        let ([x, y, z], [qx, qy, qz, qw]) = (pose.position, pose.orientation);
+        println!("position  x {x:.4}  y {y:.4}  z {z:.4} m in base");
+        println!("rotation  x {qx:.4}  y {qy:.4}  z {qz:.4}  w {qw:.4}");
+        println!("confidence {:.3}", report.confidence.unwrap_or_default());
+    }
+    if let (Some(errors), true) = (Errors::of(report), report.found) {
+        println!(
+            "truth     off by {:.1} mm and {:.2} degrees",
+            errors.position_mm, errors.rotation_deg
+        );
+    }
+    let took = report.timeline.last().map_or(0.0, |step| step.end);
+    println!("{took:.1} s on the robot's clock");
+    match &args.save {
+        Some(dir) => println!("pictures and recording.mcap are in {}", dir.display()),
+        None => println!("add --save DIR for the pictures of every step and a ROS 2 recording"),
+    }
+    Ok(())
+}

@@ -1,0 +1,91 @@
+//! `vergence tags`: who answers on the radio, and what the records say.
+
+use std::time::Duration;
+
+use clap::Args;
+use serde::Serialize;
+use vergence_tag::Record;
+
+use crate::failure::Failure;
+use crate::robot::RobotArgs;
+
+/// List the tags in radio range with their records.
+#[derive(Args)]
+pub struct Tags {
+    #[command(flatten)]
+    robot: RobotArgs,
+    /// Print the result as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+/// How long the radio listens: idle tags advertise about once a second.
+const WINDOW: Duration = Duration::from_millis(2500);
+/// Longest wait for one record.
+const TIMEOUT: Duration = Duration::from_secs(2);
+
+#[derive(Serialize)]
+struct Output {
+    tags: Vec<Tag>,
+}
+
+#[derive(Serialize)]
+struct Tag {
+    id: String,
+    address: String,
+    rssi: i8,
+    battery: Option<u8>,
+    record: Option<Record>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    error: Option<String>,
+}
+
+/// Runs the command.
+pub fn run(args: &Tags) -> Result<bool, Failure> {
+    let mut robot = args.robot.open()?;
+    let radio = &mut robot.system.robot.radio;
+    let hint = "check the radio's driver in the configuration";
+    let heard = radio.scan(WINDOW).map_err(|error| Failure::failed(error, hint))?;
+    let tags: Vec<Tag> = heard
+        .into_iter()
+        .map(|tag| {
+            let record = radio
+                .read_record(tag.address, TIMEOUT)
+                .map_err(|error| error.to_string())
+                .and_then(|bytes| {
+                    vergence_tag::cbor::decode(&bytes).map_err(|error| error.to_string())
+                });
+            let error = record.as_ref().err().cloned();
+            let (id, address) = (tag.object_id, tag.address.to_string());
+            Tag { id, address, rssi: tag.rssi, battery: tag.battery, record: record.ok(), error }
+        })
+        .collect();
+    let found = !tags.is_empty();
+    match args.json {
+        true => crate::output::json(&Output { tags })?,
+        false => print(&tags),
+    }
+    Ok(found)
+}
+
+fn print(tags: &[Tag]) {
+    if tags.is_empty() {
+        println!("no tag answers within radio range");
+        println!("  what to do: move the robot closer, check the tags' batteries");
+        return;
+    }
+    println!("{:<12} {:>5} {:>8}  {:<18} object", "id", "dBm", "battery", "address");
+    for tag in tags {
+        let battery = tag.battery.map_or("?".into(), |percent| format!("{percent} %"));
+        let object = match (&tag.record, &tag.error) {
+            (Some(record), _) => {
+                let [w, l, h] = record.bounding_box.sides().map(|side| 1e3 * side);
+                let weight = record.physical.weight;
+                let weight = weight.map_or(String::new(), |kg| format!(", {:.0} g", 1e3 * kg));
+                format!("{} {w:.0} x {l:.0} x {h:.0} mm{weight}", record.semantic.name)
+            }
+            (None, error) => error.clone().unwrap_or_default(),
+        };
+        println!("{:<12} {:>5} {battery:>8}  {:<18} {object}", tag.id, tag.rssi, tag.address);
+    }
+}

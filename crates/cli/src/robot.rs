@@ -1,0 +1,130 @@
+//! Opens the robot that a command works with: the configured devices, or the simulated workcell.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use vergence::System;
+use vergence::report::{Report, TruthReport, numbers};
+use vergence_devices::{Config, Description, Side};
+use vergence_geometry::Transform;
+use vergence_sim::{Scenario, Workcell};
+
+use crate::failure::Failure;
+
+/// Which robot.
+#[derive(Args, Clone, Default)]
+pub struct RobotArgs {
+    /// Wiring of the robot (TOML); the embedded simulated workcell without it.
+    #[arg(long, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+    /// Seed of the simulated workcell and of every random choice.
+    #[arg(long, default_value_t = 1)]
+    pub seed: u64,
+}
+
+/// A robot ready to work.
+pub struct Opened {
+    /// Devices and geometry.
+    pub system: System,
+    /// Wiring.
+    pub config: Config,
+    /// URDF.
+    pub description: Description,
+    /// The simulator, when it serves the devices.
+    workcell: Option<Workcell>,
+}
+
+/// How far a reported pose is from the simulator's truth.
+pub struct Errors {
+    /// Distance of the centres (mm).
+    pub position_mm: f64,
+    /// Angle, the object's symmetry considered (degrees).
+    pub rotation_deg: f64,
+}
+
+impl RobotArgs {
+    /// Opens what the configuration names.
+    pub fn open(&self) -> Result<Opened, Failure> {
+        match &self.config {
+            Some(path) => {
+                let (config, description) = read(path)?;
+                check_drivers(&config)?;
+                let workcell = Workcell::from_config(&config, &description, self.seed);
+                Opened::simulated(workcell.map_err(unusable)?)
+            }
+            None => Opened::embedded(self.seed, Scenario::Default),
+        }
+    }
+}
+
+impl Opened {
+    /// The embedded workcell in one of its scenarios.
+    pub fn embedded(seed: u64, scenario: Scenario) -> Result<Self, Failure> {
+        Self::simulated(Workcell::embedded_as(scenario, seed).map_err(unusable)?)
+    }
+
+    fn simulated(workcell: Workcell) -> Result<Self, Failure> {
+        let (config, description) = (workcell.config().clone(), workcell.description().clone());
+        let system = System::new(workcell.robot(), &config, &description).map_err(unusable)?;
+        Ok(Opened { system, config, description, workcell: Some(workcell) })
+    }
+
+    /// The simulator's truth of an object.
+    pub fn truth(&self, object: &str) -> Option<TruthReport> {
+        let truth = self.workcell.as_ref()?.truth();
+        let object = truth.objects.iter().find(|o| o.id == object)?;
+        let (position, orientation) = numbers(&object.base_from_object);
+        let landmark = object.landmarks.first()?.coords.into();
+        Some(TruthReport { position, orientation, landmark })
+    }
+}
+
+impl Errors {
+    /// Compares a report with the truth that it carries; `None` without a pose or a truth.
+    pub fn of(report: &Report) -> Option<Self> {
+        let (pose, truth) = (report.pose.as_ref()?, report.truth.as_ref()?);
+        let transform = |p: [f64; 3], q: [f64; 4]| {
+            let rotation = nalgebra::Quaternion::new(q[3], q[0], q[1], q[2]);
+            Transform::from_parts(p.into(), nalgebra::UnitQuaternion::from_quaternion(rotation))
+        };
+        let reported = transform(pose.position, pose.orientation);
+        let real = transform(truth.position, truth.orientation);
+        let distance = (reported.translation.vector - real.translation.vector).norm();
+        let angle = report.symmetry.angle_between(&reported.rotation, &real.rotation);
+        Some(Errors { position_mm: 1e3 * distance, rotation_deg: angle.to_degrees() })
+    }
+}
+
+/// Reads the configuration and the description that it names.
+fn read(path: &Path) -> Result<(Config, Description), Failure> {
+    let config = Config::read(path).map_err(unusable)?;
+    let urdf = path.parent().unwrap_or(Path::new("")).join(&config.robot);
+    let text = std::fs::read_to_string(&urdf).map_err(|error| {
+        Failure::misuse(
+            format!("cannot read {}: {error}", urdf.display()),
+            "the key `robot` names the URDF, relative to the configuration's folder",
+        )
+    })?;
+    let description = Description::parse(&text, &urdf).map_err(unusable)?;
+    Ok((config, description))
+}
+
+/// Refuses drivers that do not exist.
+fn check_drivers(config: &Config) -> Result<(), Failure> {
+    let heads = Side::BOTH.map(|side| config.head(side));
+    let named = heads
+        .iter()
+        .flat_map(|head| [&head.camera.driver, &head.servos.driver])
+        .chain([&config.radio.driver]);
+    match named.into_iter().find(|driver| *driver != "sim") {
+        None => Ok(()),
+        Some(driver) => Err(Failure::misuse(
+            format!("there is no driver \"{driver}\""),
+            "drivers are: sim (the simulated workcell, for all devices at once)",
+        )),
+    }
+}
+
+fn unusable(error: impl std::fmt::Display) -> Failure {
+    Failure::misuse(error, "compare with the workcell that is built in: `vergence workcell DIR`")
+}

@@ -1,0 +1,145 @@
+//! `--save DIR`: the picture of every step, and `recording.mcap`.
+//!
+//! ```text
+//! 1-difference-{left,right}.png   on/off difference with projection histograms
+//! 2-spectrum-{left,right}.png     spectra of what flickers, and the commanded frequency
+//! 3-centred-{left,right}.png      the light in the image centre
+//! 4-edges-{left,right}.png        edges of the pictures with the light off
+//! 5-field-{left,right}.png        their distance transform
+//! 6-template-{left,right}.png     the template, hidden lines removed, over the picture
+//! recording.mcap                  images, camera info, joints, tf and the result for ROS 2 tools
+//! result.json                     what --json prints
+//! ```
+
+mod landmark;
+mod pose;
+mod recorder;
+
+use std::path::{Path, PathBuf};
+
+use nalgebra::Point2;
+use vergence::{Event, Observer, Report};
+use vergence_devices::Side;
+use vergence_imaging::canvas::{Canvas, colour};
+use vergence_imaging::{CodecError, Frame, codec};
+
+use crate::failure::Failure;
+use crate::robot::Opened;
+use landmark::{SCALE, on_canvas};
+use recorder::Recorder;
+
+/// Most frames that are kept of one watch, for the explanation of the landmark's finding.
+const MOST_FRAMES: usize = 400;
+
+/// Writes the pictures and the recording of one run.
+pub struct Saver {
+    dir: PathBuf,
+    recorder: Recorder,
+    /// Frames of the watch that is going on, by side.
+    watched: [Vec<Frame>; 2],
+    /// First thing that could not be written; reported at the end, the run goes on.
+    failed: Option<Failure>,
+}
+
+impl Saver {
+    /// Makes the folder and opens the recording in it.
+    pub fn create(dir: &Path, robot: &Opened) -> Result<Self, Failure> {
+        std::fs::create_dir_all(dir).map_err(|error| cannot_write(dir, error))?;
+        let recorder = Recorder::create(&dir.join("recording.mcap"), robot)?;
+        Ok(Saver { dir: dir.into(), recorder, watched: Default::default(), failed: None })
+    }
+
+    /// Closes the recording and writes the result; the first failure of the run, if there was one.
+    pub fn finish(mut self, report: &Report) -> Result<(), Failure> {
+        self.recorder.finish(report)?;
+        let path = self.dir.join("result.json");
+        let text = serde_json::to_vec_pretty(report).map_err(|e| cannot_write(&path, e))?;
+        std::fs::write(&path, text).map_err(|error| cannot_write(&path, error))?;
+        self.failed.map_or(Ok(()), Err)
+    }
+
+    fn keep(&mut self, outcome: Result<(), Failure>) {
+        if let Err(failure) = outcome {
+            self.failed.get_or_insert(failure);
+        }
+    }
+
+    fn picture(&mut self, name: &str, side: Side, canvas: &Canvas) {
+        let path = self.dir.join(format!("{name}-{}.png", side.name()));
+        let written = codec::write_canvas(&path, canvas).map_err(unwritten);
+        self.keep(written);
+    }
+
+    fn saw(&mut self, event: &Event<'_>) {
+        match event {
+            Event::Frame(side, frame, _) => {
+                let frames = &mut self.watched[*side as usize];
+                if frames.len() < MOST_FRAMES {
+                    frames.push((*frame).clone());
+                }
+            }
+            Event::Watched(side, pattern, sightings) => {
+                let frames = std::mem::take(&mut self.watched[*side as usize]);
+                if sightings.is_empty() {
+                    return;
+                }
+                if let Some(evidence) = landmark::explain(&frames, pattern) {
+                    self.picture("1-difference", *side, &landmark::difference(&evidence));
+                    self.picture("2-spectrum", *side, &landmark::spectra(&evidence));
+                }
+                if let Some(last) = frames.last() {
+                    let seen: Vec<Point2<f64>> = sightings.iter().map(|s| s.pixel).collect();
+                    self.picture("3-centred", *side, &centred(last, &seen));
+                }
+            }
+            Event::Recognised(views, query, outcome) => {
+                let guess = match outcome {
+                    Ok(pose) => Some(*pose),
+                    Err(refusal) => refusal.best_guess(),
+                };
+                for (view, side) in views.iter().zip(Side::BOTH) {
+                    let pictures = pose::pictures(view, query, guess);
+                    self.picture("4-edges", side, &pictures.edges);
+                    self.picture("5-field", side, &pictures.field);
+                    self.picture("6-template", side, &pictures.template);
+                }
+            }
+            _ => {}
+        }
+    }
+}
+
+impl Observer for Saver {
+    fn notice(&mut self, event: &Event<'_>) {
+        let recorded = self.recorder.record(event);
+        self.keep(recorded);
+        self.saw(event);
+    }
+}
+
+/// The picture with the image centre (cross) and where the light was seen (circles).
+fn centred(frame: &Frame, seen: &[Point2<f64>]) -> Canvas {
+    let mut canvas = Canvas::from_gray(&frame.image, SCALE);
+    let centre = Point2::new(
+        (frame.image.width() as f64 - 1.0) / 2.0,
+        (frame.image.height() as f64 - 1.0) / 2.0,
+    );
+    canvas.cross(on_canvas(&centre), 24.0, colour::BLUE);
+    for (index, pixel) in seen.iter().enumerate() {
+        let colour = if index == 0 { colour::ORANGE } else { colour::PURPLE };
+        canvas.circle(on_canvas(pixel), 10.0, colour);
+    }
+    canvas.text(4, 4, 1, "cross: image centre; circle: the light", colour::WHITE);
+    canvas
+}
+
+fn unwritten(error: CodecError) -> Failure {
+    Failure::failed(error, "check the folder given with --save: is it writable, is the disk full?")
+}
+
+fn cannot_write(path: &Path, error: impl std::fmt::Display) -> Failure {
+    Failure::failed(
+        format!("cannot write {}: {error}", path.display()),
+        "check the folder given with --save: is it writable, is the disk full?",
+    )
+}

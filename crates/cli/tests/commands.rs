@@ -1,0 +1,153 @@
+//! The commands as outsiders script against them: JSON, exit status, messages that say what to do.
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use serde_json::Value;
+
+fn vergence(args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_vergence")).args(args).output().unwrap()
+}
+
+fn json(output: &Output) -> Value {
+    serde_json::from_slice(&output.stdout)
+        .unwrap_or_else(|e| panic!("{e}: {}", String::from_utf8_lossy(&output.stdout)))
+}
+
+fn numbers(value: &Value) -> Vec<f64> {
+    value.as_array().unwrap().iter().map(|v| v.as_f64().unwrap()).collect()
+}
+
+fn distance(a: &Value, b: &Value) -> f64 {
+    let squares = numbers(a).iter().zip(numbers(b)).map(|(a, b)| (a - b) * (a - b)).sum::<f64>();
+    squares.sqrt()
+}
+
+/// A folder of this test's own.
+fn folder(name: &str) -> std::path::PathBuf {
+    let dir = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
+    let _ = std::fs::remove_dir_all(&dir);
+    std::fs::create_dir_all(&dir).unwrap();
+    dir
+}
+
+#[test]
+fn a_cup_is_found_where_it_is_and_twice_alike() {
+    let output = vergence(&["find", "cup", "--json"]);
+    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stdout));
+    let report = json(&output);
+    assert_eq!(report["found"], true);
+    assert_eq!(report["object_id"], "cup");
+    let (pose, truth) = (&report["pose"], &report["truth"]);
+    let error = distance(&pose["position"], &truth["position"]);
+    assert!(error < 0.010, "position off by {:.1} mm", 1e3 * error);
+    // A cup's turn about its own axis cannot be seen: what counts is where its axis points.
+    let axis = |q: &Value| {
+        let q = numbers(q);
+        let (x, y, z, w) = (q[0], q[1], q[2], q[3]);
+        [2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)]
+    };
+    let cos: f64 = axis(&pose["orientation"])
+        .iter()
+        .zip(axis(&truth["orientation"]))
+        .map(|(a, b)| a * b)
+        .sum();
+    assert!(cos > 10f64.to_radians().cos(), "axis off by {:.1} degrees", cos.acos().to_degrees());
+    assert!(distance(&report["landmark"]["position"], &truth["landmark"]) < 0.010);
+    assert_eq!(numbers(&report["landmark"]["covariance"]).len(), 9);
+    assert_eq!(numbers(&pose["covariance"]).len(), 36);
+    let steps = report["timeline"].as_array().unwrap();
+    assert!(steps.iter().all(|s| s["end"].as_f64() >= s["start"].as_f64()), "{steps:?}");
+    assert_eq!(vergence(&["find", "cup", "--json"]).stdout, output.stdout);
+}
+
+#[test]
+fn the_papers_method_runs_and_saves_every_picture() {
+    let dir = folder("paper");
+    let path = dir.to_str().unwrap();
+    let output = vergence(&["find", "can", "--method", "paper", "--save", path, "--json"]);
+    let report = json(&output);
+    assert!(report["landmark"].is_object(), "{report}");
+    for name in ["1-difference", "2-spectrum", "3-centred", "4-edges", "5-field", "6-template"] {
+        for side in ["left", "right"] {
+            let picture = dir.join(format!("{name}-{side}.png"));
+            vergence_imaging::codec::read(&picture).unwrap();
+        }
+    }
+    let saved = std::fs::read(dir.join("result.json")).unwrap();
+    assert_eq!(serde_json::from_slice::<Value>(&saved).unwrap(), report);
+    let reader = vergence_ros::recording::Reader::open(&dir.join("recording.mcap")).unwrap();
+    assert!(reader.is_complete());
+    for topic in ["/left/image_raw", "/right/camera_info", "/joint_states", "/tf", "/result"] {
+        let found = reader.topics().iter().find(|t| t.name == topic);
+        assert!(found.is_some_and(|t| t.messages > 0), "{topic}");
+    }
+}
+
+#[test]
+fn an_unknown_object_is_not_achieved_and_says_who_answers() {
+    let output = vergence(&["find", "teapot", "--json"]);
+    assert_eq!(output.status.code(), Some(1));
+    let report = json(&output);
+    assert_eq!(report["found"], false);
+    let reason = report["reason"].as_str().unwrap();
+    assert!(reason.contains("teapot") && reason.contains("cup"), "{reason}");
+    assert!(report["hint"].as_str().unwrap().contains("vergence tags"));
+}
+
+#[test]
+fn tags_lists_the_records() {
+    let output = vergence(&["tags", "--json"]);
+    assert_eq!(output.status.code(), Some(0));
+    let tags = json(&output)["tags"].as_array().unwrap().clone();
+    let mut ids: Vec<&str> = tags.iter().map(|tag| tag["id"].as_str().unwrap()).collect();
+    ids.sort_unstable();
+    assert_eq!(ids, ["box", "can", "cup"]);
+    for tag in &tags {
+        assert_eq!(tag["record"]["object_id"], tag["id"]);
+        assert!(tag["rssi"].is_i64());
+    }
+}
+
+#[test]
+fn a_user_edits_the_workcell() {
+    let dir = folder("workcell");
+    assert_eq!(vergence(&["workcell", dir.to_str().unwrap()]).status.code(), Some(0));
+    assert_eq!(vergence(&["workcell", dir.to_str().unwrap()]).status.code(), Some(1));
+    let path = dir.join("workcell.toml");
+    let config = path.to_str().unwrap();
+    let text = std::fs::read_to_string(&path).unwrap();
+    let with = |from: &str, to: &str| {
+        assert!(text.contains(from), "{from}");
+        std::fs::write(&path, text.replacen(from, to, 1)).unwrap();
+        vergence(&["find", "cup", "--config", config, "--json"])
+    };
+    let far = with("range = 10.0", "range = 0.1");
+    assert_eq!(far.status.code(), Some(1));
+    assert!(json(&far)["reason"].as_str().unwrap().contains("heard: nobody"));
+    let dark = with("flux_px = 4.0", "flux_px = 0.0001");
+    assert_eq!(dark.status.code(), Some(1));
+    let reason = json(&dark)["reason"].as_str().unwrap().to_string();
+    assert!(reason.contains("light was not seen"), "{reason}");
+    for (from, to, said) in [
+        ("driver = \"sim\"", "driver = \"gps\"", "gps"),
+        ("clutter = 9", "cluter = 9", "cluter"),
+        ("pan_joint = \"left_pan_joint\"", "pan_joint = \"neck\"", "neck"),
+        ("robot = \"workcell.urdf\"", "robot = \"nowhere.urdf\"", "nowhere.urdf"),
+    ] {
+        let output = with(from, to);
+        let message = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(2), "{to}: {message}");
+        assert!(message.contains(said) && message.contains("what to do"), "{message}");
+        assert!(output.stdout.is_empty());
+    }
+}
+
+#[test]
+fn misuse_is_two() {
+    let missing = vergence(&["find", "cup", "--config", "no/such/file.toml"]);
+    assert_eq!(missing.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&missing.stderr).contains("no/such/file.toml"));
+    assert_eq!(vergence(&["find"]).status.code(), Some(2));
+    assert_eq!(vergence(&["experiment", "9"]).status.code(), Some(2));
+}

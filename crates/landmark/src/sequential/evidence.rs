@@ -1,0 +1,222 @@
+//! How much better a pattern explains a series than the absence of a light does.
+//!
+//! The series y and the expected light s (both freed of nuisances) are compared by a likelihood ratio
+//! in which amplitude, phase, clock rate and noise are averaged over instead of guessed:
+//! the amplitude under half-normal priors of several widths, phase and rate over the bank, the noise
+//! under an inverse-gamma prior around the noise of the neighbourhood. The last makes it Student's t:
+//! a neighbourhood noisier than thought weakens the evidence by itself. The mean of likelihood ratios
+//! over a proper prior is a likelihood ratio again, so that Ville's bound holds for it:
+//! the chance of ever passing `exp(h)` without a tag is at most `exp(-h)`.
+
+use vergence_tag::Pattern;
+
+use super::nuisance::{Nuisance, dot};
+use super::template::{Bank, Hypothesis, light};
+
+/// Weight of the neighbourhood's noise against the pixel's own, in frames.
+const NOISE_FRAMES: f64 = 40.0;
+
+/// Widths of the amplitude priors, in noise standard deviations.
+const WIDTHS: [f64; 3] = [2.0, 8.0, 32.0];
+
+/// A deviation this many times the ninth decile of all deviations is cut to it: something passed.
+const CLIP: f32 = 3.0;
+
+/// A series ready to be compared: nuisances out, outliers cut.
+#[derive(Debug, Clone)]
+pub struct Series {
+    /// Deviations (grey levels).
+    pub values: Vec<f32>,
+    /// Sum of their squares.
+    pub energy: f64,
+    /// Variance of the noise around (grey levels squared).
+    pub noise: f64,
+    /// Degrees of freedom left by the nuisances.
+    pub freedom: f64,
+    /// Courses of the surroundings that were taken out as well (unit length).
+    pub local: Vec<Vec<f32>>,
+}
+
+impl Series {
+    /// Prepares the brightness over time of one place.
+    pub fn new(raw: &[f32], nuisance: &Nuisance, local: Vec<Vec<f32>>, noise: f64) -> Self {
+        let taken = (nuisance.rank() + local.len()) as f64;
+        let freedom = (raw.len() as f64 - taken).max(1.0);
+        let mut series = Series { values: Vec::new(), energy: 0.0, noise, freedom, local };
+        let mut values = raw.to_vec();
+        series.clear(nuisance, &mut values);
+        if clip(&mut values) {
+            series.clear(nuisance, &mut values);
+        }
+        series.energy = f64::from(dot(&values, &values));
+        series.values = values;
+        series
+    }
+
+    /// Takes the nuisances of the picture and of this place out of a time course.
+    pub fn clear(&self, nuisance: &Nuisance, values: &mut [f32]) {
+        nuisance.remove(values);
+        for course in &self.local {
+            let share = dot(course, values);
+            values.iter_mut().zip(course).for_each(|(v, c)| *v -= share * c);
+        }
+    }
+
+    /// The light that a pattern at a phase and rate would give here, cleared of nuisances.
+    pub fn expect(
+        &self,
+        pattern: &Pattern,
+        times: &[(f64, f64)],
+        (phase, rate): (f64, f64),
+        nuisance: &Nuisance,
+        out: &mut Vec<f32>,
+    ) {
+        light(pattern, times, phase, rate, out);
+        self.clear(nuisance, out);
+    }
+
+    /// Energy with the prior's share added.
+    fn total(&self) -> f64 {
+        self.energy + NOISE_FRAMES * self.noise
+    }
+}
+
+/// Cuts outliers; whether there were any.
+fn clip(values: &mut [f32]) -> bool {
+    let mut sizes: Vec<f32> = values.iter().map(|v| v.abs()).collect();
+    let rank = sizes.len() * 9 / 10;
+    if rank >= sizes.len() {
+        return false;
+    }
+    let limit = CLIP * *sizes.select_nth_unstable_by(rank, f32::total_cmp).1;
+    let mut cut = false;
+    for v in values.iter_mut().filter(|v| v.abs() > limit) {
+        *v = limit.copysign(*v);
+        cut = true;
+    }
+    cut
+}
+
+/// What a series says about one pattern.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Evidence {
+    /// Natural logarithm of the likelihood ratio against "no light".
+    pub log_ratio: f64,
+    /// The best phase and rate.
+    pub best: Hypothesis,
+    /// Scalar product of series and expected light of unit length there (grey levels).
+    pub correlation: f64,
+}
+
+impl Evidence {
+    /// Amplitude of the light (grey levels).
+    pub fn amplitude(&self) -> f64 {
+        self.correlation / self.best.norm2.sqrt()
+    }
+}
+
+/// Weighs a series against a bank; `None` when no hypothesis of the bank is testable.
+///
+/// Where even the best hypothesis falls short of `floor`, its value is returned instead of the mean:
+/// an upper bound, and cheaper.
+pub fn weigh(series: &Series, bank: &Bank, floor: f64, scratch: &mut Vec<f32>) -> Option<Evidence> {
+    bank.correlate(&series.values, scratch);
+    let kept = kept(series, bank);
+    // What the surroundings took from the expected light shortens it.
+    let share = |k: usize| kept.get(k).copied().unwrap_or(1.0);
+    for (k, c) in scratch.iter_mut().enumerate() {
+        *c /= share(k).sqrt();
+    }
+    let best = (0..scratch.len()).max_by(|&a, &b| scratch[a].total_cmp(&scratch[b]))?;
+    let scaled = |k: usize| {
+        let h = bank.hypotheses[k];
+        Hypothesis { norm2: h.norm2 * f64::from(share(k)), ..h }
+    };
+    let correlation = f64::from(scratch[best]);
+    let bound = log_ratio(series, correlation, scaled(best).norm2);
+    let evidence = Evidence { log_ratio: bound, best: scaled(best), correlation };
+    if bound < floor {
+        return Some(evidence);
+    }
+    let mut sum = 0.0;
+    for (k, c) in scratch.iter().enumerate().filter(|(_, c)| **c > 0.0) {
+        sum += (log_ratio(series, f64::from(*c), scaled(k).norm2) - bound).exp();
+    }
+    let log_ratio = bound + (sum / bank.hypotheses.len() as f64).ln();
+    Some(Evidence { log_ratio, ..evidence })
+}
+
+/// Share of each hypothesis' light (squared length) that the surroundings leave; empty: all.
+fn kept(series: &Series, bank: &Bank) -> Vec<f32> {
+    if series.local.is_empty() {
+        return Vec::new();
+    }
+    let mut kept = vec![1.0f32; bank.hypotheses.len()];
+    let mut shares = Vec::new();
+    for course in &series.local {
+        bank.correlate(course, &mut shares);
+        kept.iter_mut().zip(&shares).for_each(|(k, s)| *k -= s * s);
+    }
+    // Below a tenth nothing trustworthy is left.
+    kept.iter().map(|k| if *k < 0.1 { f32::INFINITY } else { *k }).collect()
+}
+
+/// Log likelihood ratio of one phase and rate, amplitude and noise averaged over.
+fn log_ratio(series: &Series, correlation: f64, norm2: f64) -> f64 {
+    if correlation <= 0.0 {
+        return 0.0;
+    }
+    let explained = correlation * correlation / series.total();
+    let half = 0.5 * (series.freedom + NOISE_FRAMES);
+    let term = |width: &f64| {
+        let gain = width * width * norm2;
+        -0.5 * (1.0 + gain).ln() - half * (-explained * gain / (1.0 + gain)).ln_1p()
+    };
+    let terms = WIDTHS.map(|w| term(&w));
+    let largest = terms.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let mean = terms.iter().map(|t| (t - largest).exp()).sum::<f64>() / WIDTHS.len() as f64;
+    // Half-normal: the amplitude is positive, so the prior is twice as dense there.
+    largest + mean.ln() + std::f64::consts::LN_2
+}
+
+/// The best phase between those of the bank: golden-section search around the best one.
+pub fn refine(
+    series: &Series,
+    pattern: &Pattern,
+    times: &[(f64, f64)],
+    nuisance: &Nuisance,
+    start: Evidence,
+    step: f64,
+) -> Evidence {
+    let mut expected = Vec::with_capacity(times.len());
+    let mut at = |phase: f64| {
+        series.expect(pattern, times, (phase, start.best.rate), nuisance, &mut expected);
+        let norm2 = f64::from(dot(&expected, &expected)).max(1e-9);
+        let correlation = f64::from(dot(&expected, &series.values)) / norm2.sqrt();
+        let best = Hypothesis { phase, norm2, ..start.best };
+        Evidence { best, correlation, ..start }
+    };
+    let ratio = 0.5 * (5f64.sqrt() - 1.0);
+    let (mut low, mut high) = (start.best.phase - step, start.best.phase + step);
+    let inner = |low: f64, high: f64| (high - ratio * (high - low), low + ratio * (high - low));
+    let (a, b) = inner(low, high);
+    let (mut left, mut right) = (at(a), at(b));
+    for _ in 0..12 {
+        if left.correlation > right.correlation {
+            high = right.best.phase;
+            right = left;
+            left = at(inner(low, high).0);
+        } else {
+            low = left.best.phase;
+            left = right;
+            right = at(inner(low, high).1);
+        }
+    }
+    let better = if left.correlation > right.correlation { left } else { right };
+    if better.correlation > start.correlation { better } else { start }
+}
+
+/// Sum of squares that the best light leaves unexplained.
+pub fn unexplained(series: &Series, evidence: &Evidence) -> f64 {
+    (series.energy - evidence.correlation * evidence.correlation).max(0.0)
+}

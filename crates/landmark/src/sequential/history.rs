@@ -1,0 +1,107 @@
+//! The last filtered frames, and the brightness over time at any place between pixels.
+
+use std::collections::VecDeque;
+
+use nalgebra::Point2;
+use vergence_imaging::Image;
+
+use super::front::GAIN;
+use super::motion::Placement;
+use super::shift::weights;
+
+/// One frame of the past.
+#[derive(Debug, Clone)]
+pub struct Past {
+    /// Seconds since the first frame.
+    pub time: f64,
+    /// Exposure of a row (s).
+    pub exposure: f64,
+    /// Where the picture lay.
+    pub placement: Placement,
+    /// The filtered picture, moved back to where the first frame lay.
+    pub filtered: Image<i16>,
+}
+
+/// A window of frames of constant length.
+#[derive(Debug, Clone)]
+pub struct History {
+    frames: VecDeque<Past>,
+    capacity: usize,
+}
+
+impl History {
+    /// An empty window.
+    pub fn new(capacity: usize) -> Self {
+        History { frames: VecDeque::new(), capacity }
+    }
+
+    /// Adds a frame; the oldest leaves when the window is full.
+    pub fn push(&mut self, past: Past) {
+        if self.frames.len() == self.capacity {
+            self.frames.pop_front();
+        }
+        self.frames.push_back(past);
+    }
+
+    /// The frames, oldest first.
+    pub fn frames(&self) -> &VecDeque<Past> {
+        &self.frames
+    }
+
+    /// Number of frames.
+    pub fn len(&self) -> usize {
+        self.frames.len()
+    }
+
+    /// Times since the first frame and exposures (s).
+    pub fn times(&self) -> Vec<(f64, f64)> {
+        self.frames.iter().map(|p| (p.time, p.exposure)).collect()
+    }
+
+    /// Mean shift of the picture over the window (px).
+    pub fn mean_shift(&self) -> (f64, f64) {
+        let n = self.frames.len().max(1) as f64;
+        let sum =
+            |f: fn(&Placement) -> f64| self.frames.iter().map(|p| f(&p.placement)).sum::<f64>();
+        (sum(|p| p.dx) / n, sum(|p| p.dy) / n)
+    }
+
+    /// Root mean square of the shift about its mean (px).
+    pub fn shake(&self) -> f64 {
+        let (mx, my) = self.mean_shift();
+        let n = self.frames.len().max(1) as f64;
+        let square = |p: &Placement| (p.dx - mx).powi(2) + (p.dy - my).powi(2);
+        (self.frames.iter().map(|p| square(&p.placement)).sum::<f64>() / n).sqrt()
+    }
+
+    /// Brightness over time (grey levels of a light there) at a place of the first frame.
+    pub fn series(&self, place: Point2<f64>, out: &mut Vec<f32>) {
+        out.clear();
+        out.extend(self.frames.iter().map(|p| cubic(&p.filtered, place.x, place.y) / GAIN));
+    }
+
+    /// The same on a pixel.
+    pub fn series_at(&self, (x, y): (usize, usize), out: &mut Vec<f32>) {
+        out.clear();
+        let scale = 1.0 / GAIN;
+        out.extend(self.frames.iter().map(|p| f32::from(p.filtered.row(y)[x]) * scale));
+    }
+}
+
+/// Catmull-Rom interpolation between pixels, clamped to the border.
+fn cubic(image: &Image<i16>, x: f64, y: f64) -> f32 {
+    let (fx, fy) = (x.floor(), y.floor());
+    let (wx, wy) = (weights((x - fx) as f32), weights((y - fy) as f32));
+    let (x0, y0) = (fx as i64 - 1, fy as i64 - 1);
+    let clamp = |v: i64, n: usize| v.clamp(0, n as i64 - 1) as usize;
+    let mut sum = 0.0;
+    for (j, wy) in wy.iter().enumerate() {
+        let row = image.row(clamp(y0 + j as i64, image.height()));
+        let mut line = 0.0;
+        for (i, wx) in wx.iter().enumerate() {
+            line += wx * f32::from(row[clamp(x0 + i as i64, image.width())]);
+        }
+        sum += wy * line;
+    }
+    sum
+}

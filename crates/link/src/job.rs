@@ -1,0 +1,174 @@
+//! What a robot asks its radio thread for, and what comes back.
+
+use std::collections::VecDeque;
+use std::future::poll_fn;
+use std::sync::mpsc::Sender;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::task::{Poll, Waker};
+use std::time::Duration;
+
+use vergence_devices::{Advertisement, DeviceError, TagAddress, TagState};
+use vergence_tag::Command;
+
+/// Work on one tag over a link.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Task {
+    /// Read the record.
+    Record,
+    /// Command the LED.
+    Command(Command),
+    /// Write a record.
+    Write(Vec<u8>),
+    /// Read what the tag tells of itself.
+    Info,
+    /// Pair, with the passkey on the tag or without.
+    Pair(Option<u32>),
+    /// End a link that is held for a light.
+    Release,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Job {
+    Scan(Duration),
+    Attend { tag: TagAddress, task: Task, timeout: Duration },
+    AddBond(Bond),
+}
+
+/// What a tag tells of itself.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct TagInfo {
+    /// Manufacturer.
+    pub manufacturer: String,
+    /// Model.
+    pub model: String,
+    /// Firmware version.
+    pub firmware: String,
+    /// Battery level (percent), when it is known.
+    pub battery: Option<u8>,
+    /// The tag holds a record.
+    pub has_record: bool,
+    /// The LED is playing.
+    pub playing: bool,
+    /// Signal strength of the tag at the robot (dBm).
+    pub rssi: Option<i8>,
+}
+
+/// A pairing that is to outlast the process: the key and the tag it belongs to. Secret.
+#[derive(Clone, PartialEq, Eq)]
+pub struct Bond(pub(crate) [u8; BOND_BYTES]);
+
+/// Bytes of a [`Bond`].
+pub const BOND_BYTES: usize = vergence_firmware::store::BOND_BYTES;
+
+impl Bond {
+    /// From [`Bond::to_bytes`].
+    pub fn from_bytes(bytes: [u8; BOND_BYTES]) -> Self {
+        Bond(bytes)
+    }
+
+    /// For a file that nobody else reads.
+    pub fn to_bytes(&self) -> [u8; BOND_BYTES] {
+        self.0
+    }
+}
+
+impl std::fmt::Debug for Bond {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("Bond(secret)")
+    }
+}
+
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Answer {
+    Heard(Vec<Advertisement>),
+    Record(Vec<u8>),
+    State(TagState),
+    Info(TagInfo),
+    /// The bond, unless the tag makes none.
+    Paired(Option<Bond>),
+    Done,
+}
+
+/// Why a job failed.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Fault {
+    /// Its time was up.
+    Late,
+    /// The link broke or was never made; worth another try.
+    Lost,
+    /// The tag refuses or answers nonsense; another try would not help.
+    Refused(String),
+    /// The controller is gone.
+    Dead(String),
+}
+
+impl Fault {
+    /// As callers of the device traits see it.
+    pub fn device_error(self, device: String, timeout: Duration) -> DeviceError {
+        match self {
+            Fault::Late => DeviceError::Timeout { device, timeout },
+            Fault::Lost => {
+                DeviceError::Disconnected { device, reason: "the link broke".into() }
+            }
+            Fault::Refused(fault) => DeviceError::Fault { device, fault },
+            Fault::Dead(reason) => DeviceError::Disconnected { device, reason },
+        }
+    }
+}
+
+pub(crate) type Outcome = Result<Answer, Fault>;
+
+/// Jobs on their way to the radio thread.
+#[derive(Clone, Default)]
+pub(crate) struct Inbox(Arc<Mutex<Queue>>);
+
+#[derive(Default)]
+struct Queue {
+    jobs: VecDeque<(Job, Sender<Outcome>)>,
+    waker: Option<Waker>,
+    closed: bool,
+}
+
+impl Inbox {
+    fn lock(&self) -> std::sync::MutexGuard<'_, Queue> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Hands over a job; its outcome goes to `reply`.
+    pub fn push(&self, job: Job, reply: Sender<Outcome>) {
+        let mut queue = self.lock();
+        queue.jobs.push_back((job, reply));
+        queue.wake();
+    }
+
+    /// Nothing more will come.
+    pub fn close(&self) {
+        let mut queue = self.lock();
+        queue.closed = true;
+        queue.wake();
+    }
+
+    /// The next job; `None` when the inbox is closed.
+    pub async fn next(&self) -> Option<(Job, Sender<Outcome>)> {
+        poll_fn(|cx| {
+            let mut queue = self.lock();
+            match queue.jobs.pop_front() {
+                Some(job) => Poll::Ready(Some(job)),
+                None if queue.closed => Poll::Ready(None),
+                None => {
+                    queue.waker = Some(cx.waker().clone());
+                    Poll::Pending
+                }
+            }
+        })
+        .await
+    }
+}
+
+impl Queue {
+    fn wake(&mut self) {
+        if let Some(waker) = self.waker.take() {
+            waker.wake();
+        }
+    }
+}

@@ -1,0 +1,180 @@
+//! One scale of one picture: the gradient where the object can be, and its noise.
+//!
+//! **In:** a view, the region that the object can reach around its landmark, a scale (a power of
+//! two). **Out:** the Gaussian derivatives of the picture, averaged down by the scale, within the
+//! region, and the standard deviation that sensor noise gives them. Only the region is worked on,
+//! so the time depends on the object's size in pixels, not on the camera's resolution.
+
+use vergence_imaging::{Image, kernel};
+
+/// Standard deviation of the smoothing before the derivative (px of the level): wide enough to
+/// average noise, narrow enough to keep edges two pixels apart.
+const SMOOTHING_PX: f32 = 0.9;
+/// A gradient's noise is never taken to be lower (grey levels per pixel): quantisation.
+const NOISE_FLOOR: f32 = 0.12;
+
+/// A rectangle of pixels.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Region {
+    /// Leftmost column.
+    pub left: usize,
+    /// Topmost row.
+    pub top: usize,
+    /// Columns.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+}
+
+impl Region {
+    /// The part of a picture within `reach_px` of a point; `None` when there is none.
+    pub fn around(centre: (f64, f64), reach_px: f64, width: usize, height: usize) -> Option<Self> {
+        let range = |c: f64, size: usize| {
+            let low = (c - reach_px).floor().clamp(0.0, size as f64) as usize;
+            let high = (c + reach_px).ceil().clamp(0.0, size as f64) as usize;
+            (high > low + 7).then_some((low, high - low))
+        };
+        let ((left, width), (top, height)) = (range(centre.0, width)?, range(centre.1, height)?);
+        Some(Region { left, top, width, height })
+    }
+}
+
+/// The gradient of a region of a picture at one scale.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Level {
+    /// Pixels of the picture to one of this level, each way.
+    pub scale: usize,
+    /// Picture pixel of the region's top-left pixel (its own top-left corner pixel).
+    pub origin: (usize, usize),
+    /// Derivative along columns (grey levels per level pixel).
+    pub gx: Image<f32>,
+    /// Derivative along rows.
+    pub gy: Image<f32>,
+    /// Standard deviation of either derivative where there is nothing but noise.
+    pub noise: f32,
+}
+
+impl Level {
+    /// Works out one level of a picture.
+    pub fn new(image: &Image<u8>, region: &Region, scale: usize) -> Self {
+        let reduced = reduce(image, region, scale);
+        let noise = grey_noise(&reduced);
+        let smooth = kernel::gaussian_blur(&reduced, SMOOTHING_PX);
+        let (gx, gy) = slopes(&smooth);
+        // White noise of deviation s through a Gaussian derivative: s / (sqrt(8 pi) sigma^2), and
+        // the central difference smooths a little more.
+        let gain = 1.0 / ((8.0 * std::f32::consts::PI).sqrt() * (SMOOTHING_PX.powi(2) + 0.15));
+        Level {
+            scale,
+            origin: (region.left, region.top),
+            gx,
+            gy,
+            noise: (noise * gain).max(NOISE_FLOOR),
+        }
+    }
+
+    /// Columns of the level.
+    pub fn width(&self) -> usize {
+        self.gx.width()
+    }
+
+    /// Rows of the level.
+    pub fn height(&self) -> usize {
+        self.gx.height()
+    }
+
+    /// Level coordinates of a picture pixel: both count from pixel centres.
+    pub fn from_picture(&self, u: f64, v: f64) -> (f64, f64) {
+        let s = self.scale as f64;
+        ((u - self.origin.0 as f64 + 0.5) / s - 0.5, (v - self.origin.1 as f64 + 0.5) / s - 0.5)
+    }
+
+    /// Whether a position is far enough inside for interpolation.
+    pub fn contains(&self, x: f64, y: f64) -> bool {
+        x >= 1.0 && y >= 1.0 && x < self.width() as f64 - 2.0 && y < self.height() as f64 - 2.0
+    }
+
+    /// Derivative along a unit direction at a position that [`Level::contains`].
+    pub fn slope(&self, x: f64, y: f64, nx: f32, ny: f32) -> f32 {
+        let (x0, y0) = (x as usize, y as usize);
+        let (fx, fy) = ((x - x0 as f64) as f32, (y - y0 as f64) as f32);
+        let i = y0 * self.width() + x0;
+        let j = i + self.width();
+        let (gx, gy) = (self.gx.data(), self.gy.data());
+        let at = |i: usize| gx[i] * nx + gy[i] * ny;
+        let top = at(i) + fx * (at(i + 1) - at(i));
+        let bottom = at(j) + fx * (at(j + 1) - at(j));
+        top + fy * (bottom - top)
+    }
+}
+
+/// Means of `scale` x `scale` squares of a region.
+fn reduce(image: &Image<u8>, region: &Region, scale: usize) -> Image<f32> {
+    let (width, height) = ((region.width / scale).max(1), (region.height / scale).max(1));
+    let mut out = Image::filled(width, height, 0.0f32);
+    let mut sums = vec![0u32; width];
+    let weight = 1.0 / (scale * scale) as f32;
+    for y in 0..height {
+        sums.fill(0);
+        for dy in 0..scale {
+            let row = image.row((region.top + y * scale + dy).min(image.height() - 1));
+            let row = &row[region.left..region.left + region.width];
+            for (sum, square) in sums.iter_mut().zip(row.chunks_exact(scale.min(row.len()))) {
+                *sum += square.iter().map(|&v| u32::from(v)).sum::<u32>();
+            }
+        }
+        for (o, &s) in out.row_mut(y).iter_mut().zip(&sums) {
+            *o = s as f32 * weight;
+        }
+    }
+    out
+}
+
+/// Standard deviation of the noise (grey levels), from the median response to a mask that is blind
+/// to planes and to straight steps along rows and columns (Immerkaer's, with a median so that
+/// corners and texture do not count).
+fn grey_noise(image: &Image<f32>) -> f32 {
+    /// Response bins to a grey level.
+    const FINE: f32 = 4.0;
+    let (width, height) = (image.width(), image.height());
+    if width < 3 || height < 3 {
+        return 0.0;
+    }
+    let mut histogram = [0usize; 1024];
+    for y in (1..height - 1).step_by(2) {
+        let (a, b, c) = (image.row(y - 1), image.row(y), image.row(y + 1));
+        for x in 1..width - 1 {
+            let corners = a[x - 1] + a[x + 1] + c[x - 1] + c[x + 1];
+            let sides = a[x] + c[x] + b[x - 1] + b[x + 1];
+            let response = (corners - 2.0 * sides + 4.0 * b[x]).abs();
+            histogram[((response * FINE) as usize).min(1023)] += 1;
+        }
+    }
+    let half = histogram.iter().sum::<usize>() / 2;
+    let mut below = 0;
+    let median = histogram.iter().position(|n| {
+        below += n;
+        below > half
+    });
+    (median.unwrap_or(0) as f32 + 0.5) / FINE / (6.0 * 0.6745)
+}
+
+/// Central differences; the outermost rows and columns get zero.
+fn slopes(smooth: &Image<f32>) -> (Image<f32>, Image<f32>) {
+    let (width, height) = (smooth.width(), smooth.height());
+    let mut gx = Image::filled(width, height, 0.0f32);
+    let mut gy = gx.clone();
+    if width < 3 || height < 3 {
+        return (gx, gy);
+    }
+    for y in 1..height - 1 {
+        let (above, here, below) = (smooth.row(y - 1), smooth.row(y), smooth.row(y + 1));
+        for (x, g) in gx.row_mut(y)[1..width - 1].iter_mut().enumerate() {
+            *g = 0.5 * (here[x + 2] - here[x]);
+        }
+        for (x, g) in gy.row_mut(y)[1..width - 1].iter_mut().enumerate() {
+            *g = 0.5 * (below[x + 1] - above[x + 1]);
+        }
+    }
+    (gx, gy)
+}

@@ -1,0 +1,295 @@
+//! All six unknowns together, from the edges of all views, the landmark and gravity.
+//!
+//! **In:** a pose that is right to a few pixels. **Out:** the pose that maximises the likelihood of
+//! a mixture: every site's edge is one of its candidates with Gaussian error, or none. Solved by
+//! Gauss-Newton on the expected assignments (EM), the edge deviation shrinking from pass to pass
+//! (annealing). The landmark is a measurement of three numbers with its covariance.
+//!
+//! Nuisance unknowns with priors take up what would else bias the pose: the object's size is not
+//! exactly the record's, the cameras' angles are known to the servos' accuracy, and silhouettes
+//! appear a fraction of a pixel off (rounded edges, blooming, gamma). Those that belong to one view
+//! are eliminated view by view (Schur complement). The foot of a standing object, where the shadow
+//! begins, is measured only coarsely.
+
+use nalgebra::{Matrix3, Matrix6, SMatrix, SVector, Vector3};
+use vergence_geometry::Transform;
+use vergence_geometry::gaussian::{perturb, skew};
+
+use super::search::Search;
+use super::sites::{Layout, Nuisance, Site, State, sites};
+use crate::model::Kind;
+
+/// Standard deviation of an edge's place once the pose is right (px): aliasing, gamma, blooming and
+/// bent edges, not only noise.
+pub const EDGE_SD_PX: f64 = 0.3;
+/// Neighbouring sites err alike: contour length (px) that counts as one independent measurement.
+pub const CORRELATION_PX: f64 = 4.0;
+/// Density of edges that have nothing to do with the contour (per px of normal).
+pub const STRAY_DENSITY: f64 = 0.08;
+/// Deviation of a standing object's axis from gravity (rad): tables and heads are not quite level.
+const STANDING_SD: f64 = 0.006;
+/// Beyond this tilt (rad) an object is not taken to stand.
+const STANDING_LIMIT: f64 = 0.05;
+
+/// Probability that a visible contour shows no edge: occluded or without contrast.
+pub fn absence(kind: Kind) -> f64 {
+    match kind {
+        Kind::Silhouette => 0.2,
+        Kind::Crease => 0.45,
+    }
+}
+
+/// Deviation of an object's true form from its record (m): rounded edges, seams, bulging sides.
+const FORM_SD: f64 = 0.0006;
+/// Deviation of the foot's edge (m): contact shadows hide where the object ends.
+const CONTACT_SD: f64 = 0.002;
+/// Deviation of the swelling of silhouettes (px).
+const SWELL_SD_PX: f64 = 0.3;
+/// Deviation of the logarithm of the object's size: one percent.
+const SIZE_SD: f64 = 0.01;
+
+/// Deviation (px) of a site's edge when a pass works with `sd_px`.
+pub fn deviation(site: &Site, sd_px: f64) -> f64 {
+    let form = if site.contact { CONTACT_SD } else { FORM_SD };
+    sd_px.hypot(form * site.px_per_metre)
+}
+
+/// One pass of the refinement.
+#[derive(Debug, Clone, Copy)]
+pub struct Pass {
+    /// Deviation of edges (picture px).
+    pub sd_px: f64,
+    /// How sites are laid out.
+    pub layout: Layout,
+    /// At full resolution instead of the working scale.
+    pub fine: bool,
+}
+
+/// A refined pose.
+#[derive(Debug, Clone)]
+pub struct Refined {
+    /// `base_from_object`.
+    pub pose: Transform,
+    /// Logarithm of the object's size against the record's.
+    pub log_size: f64,
+    /// Each view's own unknowns.
+    pub nuisances: Vec<Nuisance>,
+    /// Covariance of the pose's tangent as the information has it.
+    pub covariance: Matrix6<f64>,
+    /// What the priors hold against this state: half their squared normalised residuals.
+    pub strain: f64,
+    /// The sites of the last pass, at the pose before its last step.
+    pub sites: Vec<Site>,
+}
+
+type Matrix7 = SMatrix<f64, 7, 7>;
+type Vector7 = SVector<f64, 7>;
+
+/// Sums of one view's normal equations.
+#[derive(Default, Clone)]
+struct Normal {
+    shared: Matrix7,
+    mixed: SMatrix<f64, 7, 3>,
+    own: Matrix3<f64>,
+    shared_rhs: Vector7,
+    own_rhs: Vector3<f64>,
+}
+
+/// Changes of the unknowns.
+#[derive(Clone)]
+struct Move {
+    shared: Vector7,
+    own: Vec<Vector3<f64>>,
+}
+
+impl Search<'_> {
+    /// Refines a pose through the given passes.
+    pub fn refine(&self, start: &Transform, passes: &[Pass]) -> Refined {
+        let views = self.sights.len();
+        let mut refined = Refined {
+            pose: *start,
+            log_size: 0.0,
+            nuisances: vec![Nuisance::default(); views],
+            covariance: Matrix6::identity(),
+            strain: 0.0,
+            sites: Vec::new(),
+        };
+        for pass in passes {
+            self.lay_out(&mut refined, pass);
+            // Two steps on the same sites: the assignments settle while the geometry is linear.
+            let mut moved = Move { shared: Vector7::zeros(), own: vec![Vector3::zeros(); views] };
+            for _ in 0..2 {
+                let Some(step) = self.step(&mut refined, pass, &moved) else { break };
+                moved.shared += step.shared;
+                moved.own.iter_mut().zip(step.own).for_each(|(m, s)| *m += s);
+            }
+            refined.apply(&moved);
+        }
+        refined.strain = self.strain(&refined);
+        refined
+    }
+
+    /// Looks for the edges around a refined pose anew.
+    pub fn lay_out(&self, refined: &mut Refined, pass: &Pass) {
+        let mut found = std::mem::take(&mut refined.sites);
+        found.clear();
+        for (view, sight) in self.sights.iter().enumerate() {
+            let level = match &sight.fine {
+                Some(fine) if pass.fine => fine,
+                _ => &sight.coarse,
+            };
+            let state = State {
+                pose: &refined.pose,
+                log_size: refined.log_size,
+                nuisance: refined.nuisances[view],
+            };
+            let up = self.query.up;
+            sites(&mut found, sight, view, level, self.model, &state, up, &pass.layout);
+        }
+        refined.sites = found;
+    }
+
+    /// One Gauss-Newton step from `moved`; keeps the covariance in `refined`.
+    fn step(&self, refined: &mut Refined, pass: &Pass, moved: &Move) -> Option<Move> {
+        let mut normals = vec![Normal::default(); self.sights.len()];
+        for site in &refined.sites {
+            let own = &moved.own[site.view];
+            let shift = (site.by_pose * moved.shared).x + (site.by_nuisance * own).x;
+            let Some((weight, residual)) = assign(site, shift, pass.sd_px) else { continue };
+            let n = &mut normals[site.view];
+            let (js, jo) = (site.by_pose.transpose(), site.by_nuisance.transpose());
+            n.shared += js * weight * site.by_pose;
+            n.mixed += js * weight * site.by_nuisance;
+            n.own += jo * weight * site.by_nuisance;
+            n.shared_rhs += js * (weight * residual);
+            n.own_rhs += jo * (weight * residual);
+        }
+        let mut now = refined.clone_state();
+        now.apply(moved);
+        let (mut a, mut b) = self.prior(&now);
+        let mut eliminated = Vec::with_capacity(normals.len());
+        for (view, n) in normals.iter_mut().enumerate() {
+            let precision = self.nuisance_precision(view);
+            n.own += Matrix3::from_diagonal(&precision);
+            n.own_rhs -= precision.component_mul(&now.nuisances[view].0);
+            let inverse = n.own.try_inverse()?;
+            a += n.shared - n.mixed * inverse * n.mixed.transpose();
+            b += n.shared_rhs - n.mixed * inverse * n.own_rhs;
+            eliminated.push(inverse);
+        }
+        let factor = a.cholesky()?;
+        refined.covariance = factor.inverse().fixed_view::<6, 6>(0, 0).into_owned();
+        let shared = factor.solve(&b);
+        let own = normals.iter().zip(eliminated);
+        let own = own.map(|(n, i)| i * (n.own_rhs - n.mixed.transpose() * shared)).collect();
+        Some(Move { shared, own })
+    }
+
+    fn nuisance_precision(&self, view: usize) -> Vector3<f64> {
+        // An exactly known angle still gets a nanoradian, so that one formula serves.
+        let turn = self.sights[view].view.turn_sd.max(1e-9).powi(-2);
+        Vector3::new(turn, turn, SWELL_SD_PX.powi(-2))
+    }
+
+    /// Residual of the landmark (m) and its derivative by the shared unknowns.
+    fn landmark_residual(&self, state: &Refined) -> (Vector3<f64>, SMatrix<f64, 3, 7>) {
+        let lever = state.pose.rotation * self.landmark * state.log_size.exp();
+        let centre = state.pose.translation.vector;
+        let mut j = SMatrix::<f64, 3, 7>::zeros();
+        j.fixed_view_mut::<3, 3>(0, 0).copy_from(&-skew(&lever));
+        j.fixed_view_mut::<3, 3>(0, 3).copy_from(&Matrix3::identity());
+        j.fixed_view_mut::<3, 1>(0, 6).copy_from(&lever);
+        (self.query.landmark.position.coords - centre - lever, j)
+    }
+
+    /// Information and right-hand side of the landmark, of gravity and of the size.
+    fn prior(&self, state: &Refined) -> (Matrix7, Vector7) {
+        let (residual, j) = self.landmark_residual(state);
+        let weight = self.query.landmark.covariance.try_inverse().unwrap_or_default();
+        let (mut a, mut b) = (j.transpose() * weight * j, j.transpose() * weight * residual);
+        if let Some(turn) = self.tilt(&state.pose) {
+            // Only the two turns that tilt the axis are measured, not the one about it.
+            let up = self.query.up.map_or(Vector3::z(), |u| u.into_inner());
+            let tilts = (Matrix3::identity() - up * up.transpose()) / (STANDING_SD * STANDING_SD);
+            let mut block = a.fixed_view_mut::<3, 3>(0, 0);
+            block += tilts;
+            let mut rhs = b.fixed_rows_mut::<3>(0);
+            rhs += tilts * turn;
+        }
+        a[(6, 6)] += SIZE_SD.powi(-2);
+        b[6] -= state.log_size * SIZE_SD.powi(-2);
+        // A solid of revolution says nothing about one turn: hold it.
+        a += Matrix7::identity() * 1e-3;
+        (a, b)
+    }
+
+    /// Half the squared normalised residuals of all priors.
+    fn strain(&self, state: &Refined) -> f64 {
+        let (residual, _) = self.landmark_residual(state);
+        let weight = self.query.landmark.covariance.try_inverse().unwrap_or_default();
+        let landmark = (residual.transpose() * weight * residual).x;
+        let size = (state.log_size / SIZE_SD).powi(2);
+        let tilt = self.tilt(&state.pose).map_or(0.0, |t| (t.norm() / STANDING_SD).powi(2));
+        let own: f64 = (0..state.nuisances.len())
+            .map(|v| {
+                let n = state.nuisances[v].0;
+                n.component_mul(&n).dot(&self.nuisance_precision(v))
+            })
+            .sum();
+        0.5 * (landmark + size + tilt + own)
+    }
+
+    /// The small turn (base frame) that would make the object stand exactly, when it seems to.
+    fn tilt(&self, pose: &Transform) -> Option<Vector3<f64>> {
+        let up = self.query.up?.into_inner();
+        let downs = match self.query.standing {
+            Some(false) => return None,
+            Some(true) => vec![-Vector3::z()],
+            None => self.model.resting_directions(),
+        };
+        let nearest = downs
+            .into_iter()
+            .map(|down| pose.rotation * -down)
+            .max_by(|a, b| a.dot(&up).total_cmp(&b.dot(&up)))?;
+        let turn = nearest.cross(&up);
+        let stands = nearest.dot(&up) > 0.0
+            && (turn.norm() < STANDING_LIMIT || self.query.standing == Some(true));
+        stands.then_some(turn)
+    }
+}
+
+impl Refined {
+    fn apply(&mut self, moved: &Move) {
+        self.pose = perturb(&self.pose, &moved.shared.fixed_rows::<6>(0).into_owned());
+        self.log_size += moved.shared[6];
+        for (nuisance, step) in self.nuisances.iter_mut().zip(&moved.own) {
+            nuisance.0 += step;
+        }
+    }
+
+    /// The unknowns without the sites.
+    fn clone_state(&self) -> Self {
+        Refined { sites: Vec::new(), nuisances: self.nuisances.clone(), ..*self }
+    }
+}
+
+/// Weight and mean residual (px) of a site whose contour has moved by `shift`.
+fn assign(site: &Site, shift: f64, sd: f64) -> Option<(f64, f64)> {
+    let sd = deviation(site, sd);
+    let missing = absence(site.kind);
+    let density = (1.0 - missing) / (sd * (2.0 * std::f64::consts::PI).sqrt());
+    let stray = missing * STRAY_DENSITY;
+    let (mut total, mut mean) = (0.0, 0.0);
+    for c in site.edges() {
+        let r = c.offset - shift;
+        let likelihood = density * c.weight * (-0.5 * (r / sd).powi(2)).exp();
+        total += likelihood;
+        mean += likelihood * r;
+    }
+    if total <= 0.0 {
+        return None;
+    }
+    let belief = total / (total + stray);
+    let weight = belief * (site.length / CORRELATION_PX).min(1.0) / (sd * sd);
+    Some((weight, mean / total))
+}

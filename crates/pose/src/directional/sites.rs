@@ -1,0 +1,236 @@
+//! Sites along a projected contour and the edges found across it.
+//!
+//! **In:** a pose, the model, a prepared view at one of its levels. **Out:** [`Site`]s: places on
+//! the contour with the normal there, how the contour moves across it when the pose changes, and
+//! *all* edges near along the normal, to a fraction of a pixel. Print runs parallel to silhouettes
+//! and shadows to feet, so the nearest or the strongest edge is often the wrong one; the refinement
+//! weighs them all.
+
+use nalgebra::{Matrix3, Point3, RowVector3, SVector, Unit, Vector3};
+use vergence_geometry::{Transform, gaussian::skew};
+
+use super::level::Level;
+use super::search::Sight;
+use crate::model::{Contour, Kind, Model};
+
+/// Most edges kept at a site.
+pub const CANDIDATES: usize = 4;
+/// A slope counts as an edge from this many noise deviations on.
+const NOISE_FACTOR: f32 = 3.5;
+
+/// An edge across the contour.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Candidate {
+    /// Offset along the site's normal (picture px).
+    pub offset: f64,
+    /// Weight, 0 to 1: strength against the strongest edge of the site.
+    pub weight: f64,
+    /// Contrast per pixel, signed along the normal (grey levels).
+    pub slope: f32,
+}
+
+/// How a site's contour moves across itself by the global unknowns: the pose's tangent (rad, m)
+/// and the logarithm of the object's size.
+pub type ByPose = nalgebra::RowSVector<f64, 7>;
+
+/// What one view's measurements share: small turns of the camera about its own x and y axes (rad),
+/// and how far its silhouettes swell outwards (px; blooming, gamma, rounded edges).
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Nuisance(pub SVector<f64, 3>);
+
+/// A place on the contour.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Site {
+    /// Which view.
+    pub view: usize,
+    /// Which segment of the contour (counts through the view).
+    pub segment: usize,
+    /// Silhouette or crease.
+    pub kind: Kind,
+    /// Picture pixel.
+    pub pixel: (f64, f64),
+    /// Unit normal in the picture.
+    pub normal: (f64, f64),
+    /// Contour length that the site stands for (picture px).
+    pub length: f64,
+    /// Size of a metre across the line of sight there (px).
+    pub px_per_metre: f64,
+    /// The foot of a standing object, where its shadow begins.
+    pub contact: bool,
+    /// Shift of the contour along the normal by the global unknowns (px per unit).
+    pub by_pose: ByPose,
+    /// The same by the view's own unknowns.
+    pub by_nuisance: RowVector3<f64>,
+    /// The edges, `count` of them.
+    pub candidates: [Candidate; CANDIDATES],
+    /// How many edges.
+    pub count: usize,
+}
+
+impl Site {
+    /// The edges found.
+    pub fn edges(&self) -> &[Candidate] {
+        &self.candidates[..self.count]
+    }
+}
+
+/// How to lay out sites.
+#[derive(Debug, Clone, Copy)]
+pub struct Layout {
+    /// Distance between sites along the contour (picture px).
+    pub spacing_px: f64,
+    /// Edges are looked for this far to either side (picture px).
+    pub range_px: f64,
+}
+
+/// What the sites are laid out for.
+#[derive(Debug, Clone, Copy)]
+pub struct State<'a> {
+    /// `base_from_object`.
+    pub pose: &'a Transform,
+    /// Logarithm of the object's size against the record's.
+    pub log_size: f64,
+    /// The view's own unknowns.
+    pub nuisance: Nuisance,
+}
+
+/// Appends the sites of one view.
+pub fn sites(
+    out: &mut Vec<Site>,
+    sight: &Sight,
+    view: usize,
+    level: &Level,
+    model: &Model,
+    state: &State,
+    up: Option<Unit<Vector3<f64>>>,
+    layout: &Layout,
+) {
+    let pose = state.pose;
+    let size = state.log_size.exp();
+    let swell = state.nuisance.0.z;
+    let turned = Transform::rotation(Vector3::new(state.nuisance.0.x, state.nuisance.0.y, 0.0));
+    let optical_from_object = turned * sight.optical_from_base * pose;
+    let optical_from_base = optical_from_object.rotation * pose.rotation.inverse();
+    let optical_from_base: Matrix3<f64> = optical_from_base.to_rotation_matrix().into_inner();
+    let eye = optical_from_object.inverse_transform_point(&Point3::origin());
+    let mut contour = Contour::new();
+    model.contour(&(eye.coords / size), true, &mut contour);
+    let camera = &sight.view.camera;
+    let Some(middle) = camera.project(&optical_from_object.translation.vector.into()) else {
+        return;
+    };
+    let up_in_object = up.map(|up| pose.rotation.inverse() * up.into_inner());
+    let mut profile = Vec::new();
+    for (index, segment) in contour.iter().enumerate() {
+        let [from, to] =
+            [segment.from, segment.to].map(|p| optical_from_object * Point3::from(p * size));
+        let (Some(a), Some(b)) = (camera.project(&from), camera.project(&to)) else { continue };
+        let length = (b - a).norm();
+        if length < 0.3 {
+            continue;
+        }
+        let contact = match (segment.away, up_in_object) {
+            (Some(away), Some(up)) => away.dot(&up) < -CONTACT_COS,
+            _ => false,
+        };
+        let n = (length / layout.spacing_px).round().max(1.0) as usize;
+        for k in 0..n {
+            let share = (k as f64 + 0.5) / n as f64;
+            // A point of the 3D segment, and the line's direction in the picture right there:
+            // both true under perspective and distortion.
+            let in_object = segment.from.lerp(&segment.to, share) * size;
+            let p = optical_from_object * Point3::from(in_object);
+            let Some((pixel, by_point)) = camera.project_with_jacobian(&p) else { continue };
+            if !camera.contains(&pixel, 1.0) {
+                continue;
+            }
+            let along = by_point * (to - from);
+            let Some(along) = along.try_normalize(1e-9) else { continue };
+            // The normal points outwards, away from the object's middle.
+            let mut normal = nalgebra::RowVector2::new(-along.y, along.x);
+            if (normal * (pixel - middle)).x < 0.0 {
+                normal = -normal;
+            }
+            let swells = segment.kind == Kind::Silhouette && !contact;
+            let pixel = if swells { pixel + normal.transpose() * swell } else { pixel };
+            let across = normal * by_point;
+            let by_base = across * optical_from_base;
+            let lever = pose.rotation * in_object;
+            let by_rotation = by_base * -skew(&lever);
+            let by_camera = across * -skew(&p.coords);
+            let mut by_pose = ByPose::zeros();
+            by_pose.fixed_columns_mut::<3>(0).copy_from(&by_rotation);
+            by_pose.fixed_columns_mut::<3>(3).copy_from(&by_base);
+            by_pose[6] = (by_base * lever).x;
+            let by_swell = if swells { 1.0 } else { 0.0 };
+            let mut site = Site {
+                view,
+                segment: index,
+                kind: segment.kind,
+                pixel: (pixel.x, pixel.y),
+                normal: (normal.x, normal.y),
+                length: length / n as f64,
+                px_per_metre: camera.fx / p.z,
+                contact,
+                by_pose,
+                by_nuisance: RowVector3::new(by_camera.x, by_camera.y, by_swell),
+                candidates: Default::default(),
+                count: 0,
+            };
+            find_edges(&mut site, level, layout.range_px, &mut profile);
+            out.push(site);
+        }
+    }
+}
+
+/// Cosine above which a face that turns away counts as the one that the object rests on.
+const CONTACT_COS: f64 = 0.99;
+
+/// Local extrema of the slope along the normal, with a parabola through the three samples.
+fn find_edges(site: &mut Site, level: &Level, range_px: f64, profile: &mut Vec<f32>) {
+    let scale = level.scale as f64;
+    let (x, y) = level.from_picture(site.pixel.0, site.pixel.1);
+    let (nx, ny) = site.normal;
+    let reach = (range_px / scale).ceil() as i32 + 1;
+    profile.clear();
+    for k in -reach..=reach {
+        let (px, py) = (x + nx * f64::from(k), y + ny * f64::from(k));
+        let inside = level.contains(px, py);
+        profile.push(if inside { level.slope(px, py, nx as f32, ny as f32) } else { 0.0 });
+    }
+    let threshold = NOISE_FACTOR * level.noise;
+    let mut strongest = 0.0f32;
+    for i in 1..profile.len() - 1 {
+        let sign = profile[i].signum();
+        let [a, b, c] = [profile[i - 1], profile[i], profile[i + 1]].map(|v| v * sign);
+        if b < threshold || b <= a || b < c {
+            continue;
+        }
+        let peak = 0.5 * (a - c) / (a - 2.0 * b + c);
+        let offset = (f64::from(i as i32 - reach) + f64::from(peak)) * scale;
+        if offset.abs() > range_px {
+            continue;
+        }
+        let height = b - 0.25 * (a - c) * peak;
+        strongest = strongest.max(height);
+        insert(site, Candidate { offset, weight: f64::from(height), slope: sign * height });
+    }
+    for candidate in &mut site.candidates[..site.count] {
+        candidate.weight = 0.3 + 0.7 * candidate.weight / f64::from(strongest);
+    }
+}
+
+/// Keeps the strongest.
+fn insert(site: &mut Site, candidate: Candidate) {
+    if site.count < CANDIDATES {
+        site.candidates[site.count] = candidate;
+        site.count += 1;
+        return;
+    }
+    let weakest = site.candidates.iter_mut().min_by(|a, b| a.weight.total_cmp(&b.weight));
+    if let Some(weakest) = weakest
+        && weakest.weight < candidate.weight
+    {
+        *weakest = candidate;
+    }
+}

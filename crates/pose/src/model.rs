@@ -1,0 +1,106 @@
+//! Size models: which contour segments of an object a camera sees.
+//!
+//! **In:** the record's shape, and the eye (camera centre) in the object frame. **Out:** straight
+//! [`Segment`]s with 3D end points in the object frame; curved contours (rims) come as chords.
+//! Hidden lines are removed. Contours of curved surfaces (a cylinder's limbs, a sphere's outline)
+//! are those seen from exactly that eye, so they must be asked for again when the pose changes;
+//! to first order they move with the body (the surface's normal is across the line of sight), so a
+//! refinement may use the points as if they were fixed.
+//!
+//! Adding a shape means a variant here and its arm in [`Model::new`] and [`Model::contour`].
+
+mod polyhedron;
+mod revolution;
+
+use nalgebra::Vector3;
+use vergence_tag::{Record, Shape};
+
+use polyhedron::Polyhedron;
+use revolution::Frustum;
+
+/// What makes a contour segment visible.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    /// The outline: object on one side, whatever is behind on the other.
+    Silhouette,
+    /// An edge between two visible faces of the object; its contrast may be poor.
+    Crease,
+}
+
+/// A straight piece of visible contour, object frame (m).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Segment {
+    /// One end.
+    pub from: Vector3<f64>,
+    /// Other end.
+    pub to: Vector3<f64>,
+    /// What it is.
+    pub kind: Kind,
+    /// Outward normal of the face that turns away there, for silhouettes where it is flat: an
+    /// object that rests on that face has a shadow, not a background, on the other side.
+    pub away: Option<Vector3<f64>>,
+}
+
+/// The visible contour: reused between calls so that the search does not allocate.
+pub type Contour = Vec<Segment>;
+
+/// An object's form.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Model {
+    /// Flat faces: box, prism, convex body.
+    Polyhedron(Polyhedron),
+    /// Cylinder or cup.
+    Frustum(Frustum),
+    /// Ball of this radius (m).
+    Sphere(f64),
+}
+
+impl Model {
+    /// The model of a record's shape; the record must have passed its own validation.
+    pub fn new(record: &Record) -> Self {
+        match &record.shape {
+            Shape::Box => Self::bounding_box(record),
+            Shape::Cylinder { diameter, height } => {
+                Model::Frustum(Frustum::new(diameter / 2.0, diameter / 2.0, *height))
+            }
+            Shape::Cup { top_diameter, bottom_diameter, height } => {
+                Model::Frustum(Frustum::new(top_diameter / 2.0, bottom_diameter / 2.0, *height))
+            }
+            Shape::Sphere { diameter } => Model::Sphere(diameter / 2.0),
+            Shape::Prism { outline, height } => {
+                Model::Polyhedron(Polyhedron::prism(outline, *height))
+            }
+            Shape::Convex { vertices } => Model::Polyhedron(Polyhedron::hull(
+                &vertices.iter().map(|&v| v.into()).collect::<Vec<_>>(),
+            )),
+        }
+    }
+
+    /// The bounding box of a record, whatever its shape: the paper's model.
+    pub fn bounding_box(record: &Record) -> Self {
+        Model::Polyhedron(Polyhedron::cuboid(record.bounding_box.sides().into()))
+    }
+
+    /// Visible contour for an eye in the object frame, written into `out` (cleared first).
+    /// `fine` asks for enough chords that a rim is true to a thousandth of its radius, else a coarse
+    /// polygon is given, good for ranking.
+    pub fn contour(&self, eye: &Vector3<f64>, fine: bool, out: &mut Contour) {
+        out.clear();
+        match self {
+            Model::Polyhedron(body) => body.contour(eye, out),
+            Model::Frustum(body) => body.contour(eye, if fine { 72 } else { 20 }, out),
+            Model::Sphere(radius) => {
+                revolution::sphere_outline(*radius, eye, if fine { 72 } else { 20 }, out)
+            }
+        }
+    }
+
+    /// Directions (object frame, unit) on which the object can rest.
+    pub fn resting_directions(&self) -> Vec<Vector3<f64>> {
+        match self {
+            Model::Polyhedron(body) => body.face_normals(),
+            Model::Frustum(_) => vec![-Vector3::z(), Vector3::z()],
+            Model::Sphere(_) => vec![-Vector3::z()],
+        }
+    }
+}

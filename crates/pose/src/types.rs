@@ -1,0 +1,190 @@
+//! What the recognisers are given and what they give back.
+
+use nalgebra::{Matrix3, Point3, Unit, UnitQuaternion, Vector3};
+use vergence_geometry::{Camera, GaussianPoint, GaussianPose, Symmetry, Transform};
+use vergence_imaging::Image;
+use vergence_tag::{Record, Shape};
+
+/// A picture, the camera that took it and where that camera was.
+#[derive(Debug, Clone, Copy)]
+pub struct View<'a> {
+    /// Grey picture.
+    pub image: &'a Image<u8>,
+    /// Intrinsic parameters; its size must be the picture's.
+    pub camera: Camera,
+    /// Pose of the camera's optical frame in the base frame.
+    pub base_from_optical: Transform,
+    /// Standard deviation of a small turn of the camera about its own x and y axes (rad): how well
+    /// the head's angles are known. Zero when exactly.
+    pub turn_sd: f64,
+}
+
+impl View<'_> {
+    /// The camera's centre in the base frame.
+    pub fn eye(&self) -> Point3<f64> {
+        self.base_from_optical.translation.vector.into()
+    }
+}
+
+/// What is looked for and what is known of it.
+#[derive(Debug, Clone, Copy)]
+pub struct Query<'a> {
+    /// The tag's record.
+    pub record: &'a Record,
+    /// The blinking landmark in the base frame (m), with its covariance.
+    pub landmark: GaussianPoint,
+    /// Which of the record's landmarks it is.
+    pub landmark_index: usize,
+    /// Direction against gravity in the base frame, when known: standing poses are tried first.
+    pub up: Option<Unit<Vector3<f64>>>,
+    /// Whether the object is known to stand upright (its z axis along `up`) or known not to;
+    /// `None` when nobody knows.
+    pub standing: Option<bool>,
+}
+
+/// Rotations that move the landmark by less than this (m) cannot be told apart by anybody: it is
+/// four standard deviations of a good triangulation.
+const SYMMETRY_SLACK: f64 = 0.004;
+/// Sides that differ by less than this (m) count as equal.
+const SIDE_TOLERANCE: f64 = 0.0005;
+
+impl Query<'_> {
+    /// The landmark's position in the object frame (m) and its outward normal.
+    pub fn landmark_in_object(&self) -> Option<(Vector3<f64>, Vector3<f64>)> {
+        let site = self.record.landmarks.get(self.landmark_index)?;
+        Some((site.position.into(), Vector3::from(site.normal).try_normalize(1e-6)?))
+    }
+
+    /// The turns of the object that neither its form nor its landmark can tell apart.
+    pub fn symmetry(&self) -> Symmetry {
+        let Some((landmark, _)) = self.landmark_in_object() else { return Symmetry::none() };
+        let keep = |q: &UnitQuaternion<f64>| (q * landmark - landmark).norm() < SYMMETRY_SLACK;
+        match &self.record.shape {
+            Shape::Box => {
+                match Symmetry::of_box(self.record.bounding_box.sides(), SIDE_TOLERANCE) {
+                    Symmetry::Finite(turns) => {
+                        Symmetry::Finite(turns.into_iter().filter(keep).collect())
+                    }
+                    other => other,
+                }
+            }
+            Shape::Cylinder { .. } => {
+                Symmetry::Revolution { flip: 2.0 * landmark.z.abs() < SYMMETRY_SLACK }
+            }
+            Shape::Cup { .. } => Symmetry::Revolution { flip: false },
+            Shape::Sphere { .. } => Symmetry::Full,
+            Shape::Prism { .. } | Shape::Convex { .. } => Symmetry::none(),
+        }
+    }
+}
+
+/// A pose that also explains the edges, less well.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Alternative {
+    /// `base_from_object`.
+    pub pose: Transform,
+    /// Share of belief, 0 to 1; with the best pose's confidence they add up to at most one.
+    pub confidence: f64,
+}
+
+/// A recognised object.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ObjectPose {
+    /// `base_from_object` with its covariance.
+    pub pose: GaussianPose,
+    /// Belief that this pose is the right one, 0 to 1.
+    pub confidence: f64,
+    /// Share of the visible contour that edges explain, 0 to 1.
+    pub coverage: f64,
+    /// Other poses, best first.
+    pub alternatives: Vec<Alternative>,
+    /// Turns about which the result says nothing.
+    pub symmetry: Symmetry,
+}
+
+/// Why there is no pose.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum Refusal {
+    /// No picture was given.
+    #[error("no picture was given")]
+    NoView,
+    /// A picture is not of its camera's size.
+    #[error("picture {view} is {picture:?} pixels large, its camera says {camera:?}")]
+    Size {
+        /// Which picture, from zero.
+        view: usize,
+        /// Its columns and rows.
+        picture: (usize, usize),
+        /// What the camera says.
+        camera: (usize, usize),
+    },
+    /// The record has no such landmark, or one without a direction.
+    #[error("the record has no usable landmark {0}")]
+    NoLandmark(usize),
+    /// The record cannot be true.
+    #[error("the record is impossible: {0}")]
+    Record(#[from] vergence_tag::Invalid),
+    /// The landmark's position or covariance is not usable.
+    #[error("the landmark's position or covariance is not usable")]
+    BadLandmark,
+    /// The landmark is in front of no camera.
+    #[error("the landmark is outside every picture")]
+    OutOfView,
+    /// No attitude shows the landmark to every camera that saw it.
+    #[error("no attitude of the object shows its landmark to the cameras")]
+    NoAttitude,
+    /// Too little of the best contour lies on edges.
+    #[error("only {:.0} % of the best contour lies on edges", 100.0 * .best.coverage)]
+    TooFewEdges {
+        /// The best guess, not to be relied on.
+        best: Box<ObjectPose>,
+    },
+    /// Another pose explains the edges about as well.
+    #[error("two different poses explain the edges about as well (confidence {:.2})", .best.confidence)]
+    Ambiguous {
+        /// The best guess, not to be relied on.
+        best: Box<ObjectPose>,
+    },
+}
+
+impl Refusal {
+    /// The best guess behind a refusal, when there was one.
+    pub fn best_guess(&self) -> Option<&ObjectPose> {
+        match self {
+            Refusal::TooFewEdges { best } | Refusal::Ambiguous { best } => Some(best),
+            _ => None,
+        }
+    }
+}
+
+/// Checks everything that came from outside; gives the landmark's place and normal in the object.
+pub(crate) fn check(
+    views: &[View],
+    query: &Query,
+) -> Result<(Vector3<f64>, Vector3<f64>), Refusal> {
+    if views.is_empty() {
+        return Err(Refusal::NoView);
+    }
+    for (view, v) in views.iter().enumerate() {
+        let picture = (v.image.width(), v.image.height());
+        let camera = (v.camera.width, v.camera.height);
+        if picture != camera || v.camera.validate().is_err() {
+            return Err(Refusal::Size { view, picture, camera });
+        }
+    }
+    query.record.validate()?;
+    let site = query.landmark_in_object().ok_or(Refusal::NoLandmark(query.landmark_index))?;
+    let covariance: &Matrix3<f64> = &query.landmark.covariance;
+    let finite = query.landmark.position.coords.iter().chain(covariance).all(|v| v.is_finite());
+    if !finite || covariance.cholesky().is_none() {
+        return Err(Refusal::BadLandmark);
+    }
+    let seen = |v: &View| {
+        let p = v.base_from_optical.inverse_transform_point(&query.landmark.position);
+        v.camera.project(&p).is_some_and(|pixel| v.camera.contains(&pixel, 0.0))
+    };
+    if !views.iter().any(seen) {
+        return Err(Refusal::OutOfView);
+    }
+    Ok(site)
+}

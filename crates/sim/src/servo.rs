@@ -1,0 +1,188 @@
+//! A servo: trapezoidal moves in steps of the encoder, latency, backlash.
+//!
+//! The motor follows a trapezoidal speed profile to the nearest encoder step. The load (the camera)
+//! hangs on it with play: it stays where it is until the motor has taken up the dead band, so that
+//! its angle depends on the side it came from.
+
+use crate::config::ServoSettings;
+
+/// One axis.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Servo {
+    resolution: f64,
+    acceleration: f64,
+    backlash: f64,
+    latency: f64,
+    speed: f64,
+    /// Move under way: from, to (rad), began at (s).
+    from: f64,
+    to: f64,
+    began: f64,
+    /// Goals that have not reached the motor yet: when they will (s), where to (rad).
+    pending: Vec<(f64, f64)>,
+    /// State at `time`.
+    time: f64,
+    motor: f64,
+    load: f64,
+}
+
+impl Servo {
+    /// At rest at zero. `speed` is the joint's limit (rad/s).
+    pub fn new(settings: &ServoSettings, speed: f64) -> Self {
+        Servo {
+            resolution: settings.resolution_deg.to_radians(),
+            acceleration: settings.acceleration,
+            backlash: settings.backlash_deg.to_radians(),
+            latency: settings.latency,
+            speed: speed.max(1e-3),
+            from: 0.0,
+            to: 0.0,
+            began: 0.0,
+            pending: Vec::new(),
+            time: 0.0,
+            motor: 0.0,
+            load: 0.0,
+        }
+    }
+
+    /// Commands an angle at time `now` (s).
+    pub fn command(&mut self, now: f64, goal: f64) {
+        let step = (goal / self.resolution).round() * self.resolution;
+        self.pending.push((now + self.latency, step));
+    }
+
+    /// Moves on to a time (s); going back is ignored.
+    pub fn advance(&mut self, time: f64) {
+        while let Some(&(at, goal)) = self.pending.first().filter(|(at, _)| *at <= time) {
+            self.settle(at.max(self.time));
+            (self.from, self.to, self.began) = (self.motor, goal, at);
+            self.pending.remove(0);
+        }
+        self.settle(time);
+    }
+
+    fn settle(&mut self, time: f64) {
+        if time <= self.time {
+            return;
+        }
+        self.motor = self.profile(time);
+        self.load =
+            self.load.clamp(self.motor - 0.5 * self.backlash, self.motor + 0.5 * self.backlash);
+        self.time = time;
+    }
+
+    /// Motor angle of the move under way.
+    fn profile(&self, time: f64) -> f64 {
+        let way = (self.to - self.from).abs();
+        let (t, a) = ((time - self.began).max(0.0), self.acceleration);
+        let ramp = (self.speed / a).min((way / a).sqrt());
+        let peak = a * ramp;
+        let cruise = if peak > 0.0 { (way - peak * ramp) / peak } else { 0.0 };
+        let total = 2.0 * ramp + cruise;
+        let done = if t >= total {
+            return self.to;
+        } else if t < ramp {
+            0.5 * a * t * t
+        } else if t < ramp + cruise {
+            0.5 * a * ramp * ramp + peak * (t - ramp)
+        } else {
+            way - 0.5 * a * (total - t).powi(2)
+        };
+        self.from + done * (self.to - self.from).signum()
+    }
+
+    /// What the encoder tells (rad).
+    pub fn encoder(&self) -> f64 {
+        (self.motor / self.resolution).round() * self.resolution
+    }
+
+    /// A move is under way or on its way.
+    pub fn moving(&self) -> bool {
+        !self.pending.is_empty() || self.motor != self.to
+    }
+
+    /// Where the camera really is (rad).
+    pub fn load(&self) -> f64 {
+        self.load
+    }
+
+    /// Dead band (rad).
+    pub fn backlash(&self) -> f64 {
+        self.backlash
+    }
+
+    /// Encoder step (rad).
+    pub fn resolution(&self) -> f64 {
+        self.resolution
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn servo() -> Servo {
+        Servo::new(&ServoSettings::default(), 3.6)
+    }
+
+    #[test]
+    fn angles_are_multiples_of_the_step() {
+        let mut servo = servo();
+        servo.command(0.0, 0.1);
+        servo.advance(2.0);
+        let steps = servo.encoder() / 0.35f64.to_radians();
+        assert!((steps - steps.round()).abs() < 1e-9 && (servo.encoder() - 0.1).abs() < 0.0031);
+        assert_eq!(servo.motor, servo.encoder(), "rests on the step");
+        assert!(!servo.moving());
+    }
+
+    #[test]
+    fn speed_and_latency_are_kept() {
+        let mut servo = servo();
+        servo.command(0.0, 1.0);
+        servo.advance(0.0079);
+        assert_eq!(servo.motor, 0.0, "nothing moves before the latency");
+        let mut fastest = 0.0f64;
+        let mut last = 0.0;
+        for k in 8..1000 {
+            servo.advance(f64::from(k) * 1e-3);
+            fastest = fastest.max((servo.motor - last) / 1e-3);
+            last = servo.motor;
+        }
+        assert!(fastest <= 3.6 + 1e-6 && fastest > 3.5, "fastest {fastest}");
+        // 1 rad at 3.6 rad/s and 40 rad/s^2: 0.278 s of cruise and 0.09 s of ramps.
+        let mut again = super::Servo::new(&ServoSettings::default(), 3.6);
+        again.command(0.0, 1.0);
+        again.advance(0.008 + 0.36);
+        assert!(again.moving());
+        again.advance(0.008 + 0.375);
+        assert!(!again.moving());
+    }
+
+    #[test]
+    fn the_load_lags_by_the_dead_band() {
+        let mut servo = servo();
+        let arrive = |servo: &mut Servo, at: f64, goal: f64| {
+            servo.command(at, goal);
+            servo.advance(at + 1.0);
+            servo.load() - servo.encoder()
+        };
+        let half = 0.075f64.to_radians();
+        let step = 0.35f64.to_radians();
+        assert!((arrive(&mut servo, 0.0, 20.0 * step) + half).abs() < 1e-12);
+        assert!((arrive(&mut servo, 2.0, 40.0 * step) + half).abs() < 1e-12);
+        assert!((arrive(&mut servo, 4.0, 20.0 * step) - half).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_new_goal_takes_over() {
+        let mut servo = servo();
+        servo.command(0.0, 1.0);
+        servo.advance(0.15);
+        let there = servo.motor;
+        assert!(there > 0.1 && there < 0.9);
+        servo.command(0.15, 0.0);
+        servo.advance(2.0);
+        assert_eq!(servo.encoder(), 0.0);
+    }
+}

@@ -1,0 +1,271 @@
+//! The workcell as its user sees it: built from a configuration, opened as a robot.
+
+use std::collections::VecDeque;
+use std::path::Path;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use nalgebra::{Point3, Unit, UnitQuaternion, Vector3};
+use rand::RngExt;
+use vergence_devices::{Config, Description, Head, Robot, Side, TagAddress};
+use vergence_geometry::{Camera as Lens, Chain, Transform};
+use vergence_tag::{Pattern, pattern::Bits};
+
+use crate::camera::{Blinker, Sensor};
+use crate::config::{GeometryError, Scenario, SimConfig};
+use crate::devices::{SimCamera, SimClock, SimPanTilt};
+use crate::error::SimError;
+use crate::lights::Play;
+use crate::noise::{normal, stream};
+use crate::placement::{RestView, TaggedObject, compose};
+use crate::radio::{Air, SimRadio, Tag};
+use crate::servo::Servo;
+use crate::trace::Stage;
+use crate::world::{Shared, Shutter, TrueHead, World, lock};
+use crate::{EMBEDDED_CONFIG, EMBEDDED_URDF};
+
+/// A simulated workcell.
+pub struct Workcell {
+    config: Config,
+    description: Description,
+    settings: SimConfig,
+    seed: u64,
+    world: Shared,
+}
+
+/// What is really so: for judging results, never for producing them.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Truth {
+    /// Tagged objects.
+    pub objects: Vec<TrueObject>,
+    /// Left and right camera as they are now.
+    pub cameras: [TrueCamera; 2],
+}
+
+/// A tagged object as it stands.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TrueObject {
+    /// Its identifier.
+    pub id: String,
+    /// Its pose.
+    pub base_from_object: Transform,
+    /// Its LEDs (base frame).
+    pub landmarks: Vec<Point3<f64>>,
+}
+
+/// A camera as it is.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TrueCamera {
+    /// Lens.
+    pub lens: Lens,
+    /// Pose.
+    pub base_from_optical: Transform,
+}
+
+impl Workcell {
+    /// The embedded workcell.
+    pub fn embedded(seed: u64) -> Result<Self, SimError> {
+        Self::embedded_as(Scenario::Default, seed)
+    }
+
+    /// The embedded workcell in another scenario.
+    pub fn embedded_as(scenario: Scenario, seed: u64) -> Result<Self, SimError> {
+        let (config, description) = embedded_files()?;
+        let mut settings = settings(&config)?;
+        settings.scenario = scenario;
+        Self::new(config, description, settings, seed)
+    }
+
+    /// A workcell from a user's files. A configuration without `[sim]` gets the embedded table.
+    pub fn from_config(
+        config: &Config,
+        description: &Description,
+        seed: u64,
+    ) -> Result<Self, SimError> {
+        Self::new(config.clone(), description.clone(), settings(config)?, seed)
+    }
+
+    /// A workcell with the simulator's settings given directly.
+    pub fn new(
+        config: Config,
+        description: Description,
+        settings: SimConfig,
+        seed: u64,
+    ) -> Result<Self, SimError> {
+        let mut heads = Vec::new();
+        let mut views = Vec::new();
+        for side in Side::BOTH {
+            let wiring = config.head(side);
+            let names = [wiring.pan_joint.as_str(), wiring.tilt_joint.as_str()];
+            let chain = description.chain_with(ROOT, &wiring.optical_frame, &names)?;
+            let lens = wiring.camera.model();
+            let base_from_optical = chain.forward(&[0.0, 0.0]);
+            views.push(RestView { camera: lens, base_from_optical });
+            heads.push(true_head(&settings, chain, lens, seed, side));
+        }
+        let [left, right]: [TrueHead; 2] =
+            heads.try_into().map_err(|_| SimError::Table("two heads".into()))?;
+        let views = [views[0], views[1]];
+        let composition = compose(&settings, &views, seed)?;
+        let tags = tags(&settings, &composition.objects, seed);
+        let status = composition.status.map(|emitter| {
+            let half = Duration::from_secs_f64(0.5 / settings.light.status_hz);
+            let plays = status_play(half, seed).into_iter().collect();
+            Blinker { emitter, plays }
+        });
+        let c = &settings.camera;
+        let rows = left.lens.height.max(right.lens.height) as f64;
+        let (period, readout) = (1.0 / c.frame_rate, c.row_time * (rows - 1.0));
+        if readout + c.exposure > period {
+            return Err(SimError::Range {
+                key: "camera.row_time",
+                value: c.row_time,
+                low: 0.0,
+                high: (period - c.exposure) / (rows - 1.0).max(1.0),
+            });
+        }
+        let phase = stream(seed, "shutter", 0).random::<f64>() * period;
+        let world = World {
+            heads: [left, right],
+            objects: composition.objects,
+            tags,
+            air: Air::new(seed),
+            status,
+            stage: Arc::new(Stage::new(composition.scene)),
+            shutter: Shutter { phase, period, exposure: c.exposure, readout },
+            now: Duration::ZERO,
+            frame: 0,
+            exposing: None,
+            captures: VecDeque::new(),
+            settings: settings.clone(),
+        };
+        Ok(Workcell { config, description, settings, seed, world: Arc::new(Mutex::new(world)) })
+    }
+
+    /// Opens the devices. All robots of one workcell share its world and time.
+    pub fn robot(&self) -> Robot {
+        let head = |side: Side| {
+            let lens = lock(&self.world).heads[side as usize].lens;
+            let (camera, light) = (self.settings.camera, &self.settings.light);
+            let sensor = Sensor::new(lens, camera, light, self.seed, side as usize);
+            let world = self.world.clone();
+            Head {
+                camera: Box::new(SimCamera { world: world.clone(), side, sensor, next: 0 }),
+                pan_tilt: Box::new(SimPanTilt { world, side }),
+            }
+        };
+        Robot {
+            clock: Box::new(SimClock { world: self.world.clone() }),
+            heads: Side::BOTH.map(head),
+            radio: Box::new(SimRadio::new(self.world.clone())),
+        }
+    }
+
+    /// What is really so, at this moment.
+    pub fn truth(&self) -> Truth {
+        let world = lock(&self.world);
+        let objects = world.objects.iter().map(|object| TrueObject {
+            id: object.record.object_id.to_string(),
+            base_from_object: object.base_from_object,
+            landmarks: object.record.landmarks.iter().map(|site| object.landmark(site)).collect(),
+        });
+        let cameras = [0, 1].map(|side| {
+            let head = &world.heads[side];
+            TrueCamera { lens: head.lens, base_from_optical: head.base_from_optical() }
+        });
+        Truth { objects: objects.collect(), cameras }
+    }
+
+    /// The wiring: what the robot knows of its cameras and joints.
+    pub fn config(&self) -> &Config {
+        &self.config
+    }
+
+    /// The robot's description: what it knows of its geometry.
+    pub fn description(&self) -> &Description {
+        &self.description
+    }
+
+    /// The simulator's settings.
+    pub fn settings(&self) -> &SimConfig {
+        &self.settings
+    }
+}
+
+/// Root link of all chains.
+const ROOT: &str = "base";
+
+/// The embedded wiring and description.
+pub fn embedded_files() -> Result<(Config, Description), SimError> {
+    let config = Config::parse(EMBEDDED_CONFIG, Path::new("embedded workcell.toml"))?;
+    let description = Description::parse(EMBEDDED_URDF, Path::new("embedded workcell.urdf"))?;
+    Ok((config, description))
+}
+
+/// The `[sim]` table of a configuration, else the embedded one.
+pub fn settings(config: &Config) -> Result<SimConfig, SimError> {
+    match &config.sim {
+        Some(table) => SimConfig::from_table(table),
+        None => match embedded_files()?.0.sim {
+            Some(table) => SimConfig::from_table(&table),
+            None => Ok(SimConfig::default()),
+        },
+    }
+}
+
+/// The head as built: the URDF's, off by the configured errors.
+fn true_head(
+    settings: &SimConfig,
+    mut chain: Chain,
+    mut lens: Lens,
+    seed: u64,
+    side: Side,
+) -> TrueHead {
+    let GeometryError { joint_zero_deg, axis_skew_deg, lever_arm, focal_ratio } =
+        settings.geometry_error;
+    let mut rng = stream(seed, "geometry", side as u64);
+    for joint in &mut chain.joints {
+        let skew = Vector3::from_fn(|_, _| normal(&mut rng)) * axis_skew_deg.to_radians();
+        joint.axis =
+            Unit::new_normalize(UnitQuaternion::from_scaled_axis(skew) * joint.axis.into_inner());
+        let zero = normal(&mut rng) * joint_zero_deg.to_radians();
+        let turn = UnitQuaternion::from_axis_angle(&joint.axis, zero);
+        joint.parent_from_joint *= Transform::from_parts(Default::default(), turn);
+    }
+    let lever = Vector3::from_fn(|_, _| normal(&mut rng)) * lever_arm;
+    chain.last_from_tip.translation.vector += lever;
+    let stretch = 1.0 + normal(&mut rng) * focal_ratio;
+    (lens.fx, lens.fy) = (lens.fx * stretch, lens.fy * stretch);
+    let speed = |k: usize| chain.joints.get(k).map_or(1.0, |joint| joint.limits.velocity);
+    let servos = [0, 1].map(|k| Servo::new(&settings.servos, speed(k)));
+    TrueHead { chain, lens, servos }
+}
+
+fn tags(settings: &SimConfig, objects: &[TaggedObject], seed: u64) -> Vec<Tag> {
+    let mut rng = stream(seed, "tags", 0);
+    let tag = |object: &TaggedObject| {
+        let mut address: [u8; 6] = rng.random();
+        address[0] |= 0xC0; // a random static address
+        let mut bytes = Vec::new();
+        // A Vec cannot refuse bytes, and records were validated; an empty record shows if ever.
+        if vergence_tag::cbor::encode(&object.record, &mut bytes).is_err() {
+            bytes.clear();
+        }
+        Tag {
+            address: TagAddress(address),
+            record: object.record.clone(),
+            bytes,
+            rate: 1.0 + 1e-6 * settings.led.clock_ppm * normal(&mut rng),
+            battery: rng.random_range(40..=100),
+            plays: Vec::new(),
+        }
+    };
+    objects.iter().map(tag).collect()
+}
+
+/// The status light has always been blinking.
+fn status_play(half: Duration, seed: u64) -> Option<Play> {
+    let pattern = Pattern::new(Bits::FLICKER, half).ok()?;
+    let begin = -2.0 * half.as_secs_f64() * stream(seed, "status", 0).random::<f64>() - 1.0;
+    Some(Play { begin, end: f64::INFINITY, pattern, rate: 1.0 })
+}

@@ -1,0 +1,304 @@
+//! Find: the nine steps of the paper (section 2), one function each, over device traits only.
+//!
+//! ```text
+//! radio -> record -> blink -> search -> centre -> triangulate -> look -> recognise
+//! ```
+//!
+//! In: an object's name. Out: a [`Report`]; it is complete also when the search ends early, and
+//! then says why and what to do. Devices that fail end the run; the LED is told to stop in any case.
+
+use std::time::Duration;
+
+use vergence_devices::{Advertisement, DeviceError, LedCommand, Side, TagAddress};
+use vergence_geometry::{GaussianPoint, Symmetry, Transform};
+use vergence_imaging::Frame;
+use vergence_landmark::FinderError;
+use vergence_pose::{ObjectPose, Query, Refusal, View};
+use vergence_tag::{Pattern, Record, RecordError};
+
+use crate::event::{Event, Observer};
+use crate::report::{AlternativeReport, LandmarkReport, PoseReport, Report, Step, numbers};
+use crate::system::System;
+
+mod blink;
+mod centre;
+mod search;
+
+/// Which recognition is used.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Method {
+    /// As published in 2005: on/off differences, box template, distance transform, correlation.
+    Paper,
+    /// Sequential decision on coded light, directional distance fields, joint refinement.
+    #[default]
+    Directional,
+}
+
+/// Settings of a find.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FindConfig {
+    /// Which recognition is used.
+    pub method: Method,
+    /// How long the radio listens for tags: a few advertising intervals of an idle tag (1 s each).
+    pub scan_window: Duration,
+    /// Longest wait for one answer of a tag: links come up within half a second, with retries.
+    pub link_timeout: Duration,
+    /// Times that a command or read is tried before the tag counts as lost.
+    pub link_tries: usize,
+    /// Seed for the choice of patterns.
+    pub seed: u64,
+}
+
+impl Default for FindConfig {
+    fn default() -> Self {
+        FindConfig {
+            method: Method::default(),
+            scan_window: Duration::from_millis(1500),
+            link_timeout: Duration::from_secs(2),
+            link_tries: 3,
+            seed: 0,
+        }
+    }
+}
+
+/// Why a find ended without a pose.
+#[derive(Debug, thiserror::Error)]
+enum Stop {
+    #[error("no tag of \"{object}\" answers on the radio (heard: {heard})")]
+    OutOfRange { object: String, heard: String },
+    #[error("{count} tags claim to be \"{object}\"")]
+    Ambiguous { object: String, count: usize },
+    #[error("the tag's record is not usable: {0}")]
+    Record(#[from] RecordError),
+    #[error("the tag advertises \"{advertised}\" but its record says \"{recorded}\"")]
+    WrongRecord { advertised: String, recorded: String },
+    #[error("the tag answers, but its light was not seen in {views} views by {missing}")]
+    NotSeen { views: usize, missing: &'static str },
+    #[error("the light was seen by the {0} head and lost while it was centred")]
+    Lost(&'static str),
+    #[error("the two heads do not see one and the same light: {0}")]
+    Triangulation(#[from] vergence_head::TriangulateError),
+    #[error("the pictures were refused: {0}")]
+    Frames(#[from] FinderError),
+    #[error("{0}")]
+    Refused(#[from] Refusal),
+    #[error("{0}")]
+    Device(#[from] DeviceError),
+}
+
+impl Stop {
+    /// What a person can do about it.
+    fn hint(&self) -> &'static str {
+        match self {
+            Stop::OutOfRange { .. } => {
+                "move the robot closer, check the tag's battery and the spelling; `vergence tags` lists who answers"
+            }
+            Stop::Ambiguous { .. } => "switch one of the tags off, or write another id to it",
+            Stop::Record(_) | Stop::WrongRecord { .. } => "write a correct record to the tag",
+            Stop::NotSeen { .. } => {
+                "turn the object so that its landmark faces the cameras, or remove what hides it"
+            }
+            Stop::Lost(_) => "keep the object still while it is being found, then try again",
+            Stop::Triangulation(_) => {
+                "look for mirrors near the object; if it happens everywhere, calibrate the heads"
+            }
+            Stop::Frames(_) => "check the camera's format and its time stamps",
+            Stop::Refused(_) => {
+                "free the view of the object, add light, or check the record's size and shape"
+            }
+            Stop::Device(_) => "check cables, power and the configuration file",
+        }
+    }
+}
+
+/// Finds an object and recognises its pose.
+pub fn find(
+    system: &mut System,
+    object: &str,
+    config: &FindConfig,
+    observer: &mut dyn Observer,
+) -> Report {
+    let mut run = Run { system, config, observer, timeline: Vec::new(), landmark: None };
+    let outcome = run.all(object);
+    let mut report = Report {
+        object_id: object.into(),
+        found: outcome.is_ok(),
+        reason: None,
+        hint: None,
+        landmark: run.landmark,
+        pose: None,
+        confidence: None,
+        symmetry: Symmetry::none(),
+        alternatives: Vec::new(),
+        timeline: run.timeline,
+        truth: None,
+    };
+    match outcome {
+        Ok(found) => {
+            report.pose = Some(PoseReport::new(&found.pose));
+            report.confidence = Some(found.confidence);
+            report.symmetry = found.symmetry;
+            report.alternatives = found.alternatives.iter().map(alternative).collect();
+        }
+        Err(stop) => {
+            report.reason = Some(stop.to_string());
+            report.hint = Some(stop.hint());
+        }
+    }
+    report
+}
+
+fn alternative(other: &vergence_pose::Alternative) -> AlternativeReport {
+    let (position, orientation) = numbers(&other.pose);
+    AlternativeReport { position, orientation, confidence: other.confidence }
+}
+
+/// One run: what the steps share.
+struct Run<'a> {
+    system: &'a mut System,
+    config: &'a FindConfig,
+    observer: &'a mut dyn Observer,
+    timeline: Vec<Step>,
+    landmark: Option<LandmarkReport>,
+}
+
+impl Run<'_> {
+    fn all(&mut self, object: &str) -> Result<ObjectPose, Stop> {
+        let tag = self.step("radio", |run| run.radio(object))?;
+        let record = self.step("record", |run| run.record(&tag))?;
+        let pattern = self.step("blink", |run| run.start_blinking(tag.address))?;
+        let landmark = self.locate(&pattern);
+        // The light must go out whether or not it was seen: for the pictures, and for the battery.
+        let stopped = self.step("stop", |run| run.command(tag.address, LedCommand::Stop));
+        let (landmark, angles) = landmark?;
+        stopped?;
+        let frames = self.step("look", Self::look)?;
+        self.step("recognise", |run| run.recognise(&record, landmark, &frames, angles))
+    }
+
+    /// Search, centring and triangulation, while the light blinks.
+    fn locate(&mut self, pattern: &Pattern) -> Result<(GaussianPoint, [[f64; 2]; 2]), Stop> {
+        let seen = self.step("search", |run| run.search(pattern))?;
+        let held = self.step("centre", |run| run.centre(pattern, seen))?;
+        let landmark = self.step("triangulate", |run| run.triangulate(&held))?;
+        Ok((landmark, held.map(|fixation| fixation.angles)))
+    }
+
+    /// Runs one step and enters its times in the timeline.
+    fn step<T>(
+        &mut self,
+        name: &'static str,
+        work: impl FnOnce(&mut Self) -> Result<T, Stop>,
+    ) -> Result<T, Stop> {
+        let start = self.now();
+        self.observer.notice(&Event::Begun(name));
+        let outcome = work(self);
+        let step = Step { step: name, start, end: self.now() };
+        self.observer.notice(&Event::Done(&step));
+        self.timeline.push(step);
+        outcome
+    }
+
+    fn now(&self) -> f64 {
+        self.system.robot.clock.now().as_secs_f64()
+    }
+
+    /// Who answers on the radio and is the wanted object.
+    fn radio(&mut self, object: &str) -> Result<Advertisement, Stop> {
+        let heard = self.system.robot.radio.scan(self.config.scan_window)?;
+        self.observer.notice(&Event::Heard(&heard));
+        let mut wanted = heard.iter().filter(|tag| tag.object_id == object);
+        match (wanted.next(), wanted.count()) {
+            (Some(tag), 0) => Ok(tag.clone()),
+            (Some(_), others) => Err(Stop::Ambiguous { object: object.into(), count: others + 1 }),
+            (None, _) => {
+                let names: Vec<&str> = heard.iter().map(|tag| tag.object_id.as_str()).collect();
+                let heard = if names.is_empty() { "nobody".into() } else { names.join(", ") };
+                Err(Stop::OutOfRange { object: object.into(), heard })
+            }
+        }
+    }
+
+    /// The object's record, checked against what the tag advertised.
+    fn record(&mut self, tag: &Advertisement) -> Result<Record, Stop> {
+        let timeout = self.config.link_timeout;
+        let bytes = self.retry(|radio| radio.read_record(tag.address, timeout))?;
+        let record = vergence_tag::cbor::decode(&bytes)?;
+        if record.object_id.as_str() != tag.object_id {
+            let (advertised, recorded) = (tag.object_id.clone(), record.object_id.to_string());
+            return Err(Stop::WrongRecord { advertised, recorded });
+        }
+        self.observer.notice(&Event::Record(tag.address, &record));
+        Ok(record)
+    }
+
+    fn command(&mut self, tag: TagAddress, command: LedCommand) -> Result<(), Stop> {
+        let timeout = self.config.link_timeout;
+        self.retry(|radio| radio.command(tag, command, timeout))?;
+        self.observer.notice(&Event::Led(command));
+        Ok(())
+    }
+
+    /// Radio links fail now and then: tries again before giving up.
+    fn retry<T>(
+        &mut self,
+        mut call: impl FnMut(&mut dyn vergence_devices::TagLink) -> Result<T, DeviceError>,
+    ) -> Result<T, Stop> {
+        let mut tries = 1;
+        loop {
+            match call(self.system.robot.radio.as_mut()) {
+                Err(DeviceError::Timeout { .. } | DeviceError::Disconnected { .. })
+                    if tries < self.config.link_tries =>
+                {
+                    tries += 1;
+                }
+                other => return Ok(other?),
+            }
+        }
+    }
+
+    /// One picture of either camera with the light off.
+    fn look(&mut self) -> Result<[Frame; 2], Stop> {
+        let since = self.system.robot.clock.now();
+        let joints = self.system.joints()?;
+        let left = self.system.frame_since(0, since)?;
+        let right = self.system.frame_since(1, since)?;
+        self.observer.notice(&Event::Frame(Side::Left, &left, joints[0]));
+        self.observer.notice(&Event::Frame(Side::Right, &right, joints[1]));
+        Ok([left, right])
+    }
+
+    /// Steps 4 to 9 of the paper: the object's pose from both pictures, its size and the landmark.
+    fn recognise(
+        &mut self,
+        record: &Record,
+        landmark: GaussianPoint,
+        frames: &[Frame; 2],
+        angles: [[f64; 2]; 2],
+    ) -> Result<ObjectPose, Stop> {
+        let poses: [Transform; 2] =
+            std::array::from_fn(|k| self.system.heads[k].base_from_optical(angles[k]));
+        let noise = self.noise();
+        let views: [View<'_>; 2] = std::array::from_fn(|k| View {
+            image: &frames[k].image,
+            camera: self.system.heads[k].camera,
+            base_from_optical: poses[k],
+            turn_sd: noise.step_sigma.hypot(noise.common_sigma),
+        });
+        let query = Query {
+            record,
+            landmark,
+            landmark_index: 0,
+            up: Some(nalgebra::Vector3::z_axis()),
+            standing: None,
+        };
+        let outcome = match self.config.method {
+            Method::Paper => vergence_pose::paper::recognise(&views, &query, &Default::default()),
+            Method::Directional => {
+                vergence_pose::directional::recognise(&views, &query, &Default::default())
+            }
+        };
+        self.observer.notice(&Event::Recognised(&views, &query, outcome.as_ref()));
+        Ok(outcome?)
+    }
+}

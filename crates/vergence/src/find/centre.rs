@@ -1,0 +1,137 @@
+//! Steps 2 and 3 of the paper: the light is brought to the centre of both pictures, and the joint
+//! angles give its place.
+
+use vergence_devices::{JointReading, Side};
+use vergence_geometry::GaussianPoint;
+use vergence_head::{
+    Fixation, Fixator, FixatorConfig, GATE_SIGMAS, NextMove, Noise, PaperAngles, epipolar_gap,
+    paper_distance, triangulate,
+};
+use vergence_landmark::Sighting;
+use vergence_tag::Pattern;
+
+use super::search::Seen;
+use super::{Run, Stop};
+use crate::event::Event;
+use crate::report::LandmarkReport;
+
+/// Moves after which the rest is left in the pixel.
+const MAX_MOVES: usize = 3;
+
+impl Run<'_> {
+    /// Centres the light in both pictures.
+    pub(super) fn centre(
+        &mut self,
+        pattern: &Pattern,
+        seen: [Seen; 2],
+    ) -> Result<[Fixation; 2], Stop> {
+        let mut held = self.same_light(&seen);
+        let mut fixators = [0, 1].map(|k| {
+            let servos = &self.system.robot.heads[k].pan_tilt;
+            Fixator::new(FixatorConfig {
+                resolution: servos.resolution(),
+                backlash: servos.backlash(),
+                max_moves: MAX_MOVES,
+            })
+        });
+        loop {
+            let moves: [NextMove; 2] = std::array::from_fn(|k| {
+                let (joints, sighting) = &held[k];
+                let angles = [joints.pan, joints.tilt];
+                fixators[k].next(&self.system.heads[k], angles, &sighting.pixel, None)
+            });
+            if moves == [NextMove::Hold; 2] {
+                break;
+            }
+            let joints = self.approach(&moves)?;
+            let moved: [bool; 2] = std::array::from_fn(|k| moves[k] != NextMove::Hold);
+            let readings = std::array::from_fn(|k| moved[k].then_some(joints[k]));
+            let sightings = self.watch(pattern, readings)?;
+            for (k, sightings) in sightings.into_iter().enumerate().filter(|(k, _)| moved[*k]) {
+                let nearest = self.nearest_to_centre(k, sightings);
+                held[k] = (joints[k], nearest.ok_or(Stop::Lost(Side::BOTH[k].name()))?);
+            }
+        }
+        for (side, (joints, sighting)) in Side::BOTH.iter().zip(&held) {
+            self.observer.notice(&Event::Centred(*side, *joints, sighting));
+        }
+        Ok(held.map(|(joints, sighting)| fixation(&joints, &sighting)))
+    }
+
+    /// Of all places that either head saw, the pair that can be one light: the brightest whose lines
+    /// of sight meet, else the pair that comes nearest. Mirrors show the pattern elsewhere.
+    fn same_light(&self, seen: &[Seen; 2]) -> [(JointReading, Sighting); 2] {
+        let noise = self.noise();
+        let gap = |left: &Sighting, right: &Sighting| {
+            let pair = [fixation(&seen[0].joints, left), fixation(&seen[1].joints, right)];
+            epipolar_gap(&self.system.heads, &pair, &noise)
+        };
+        let brightest = [&seen[0].sightings[0], &seen[1].sightings[0]];
+        let mut best = (gap(brightest[0], brightest[1]), brightest);
+        for left in &seen[0].sightings {
+            for right in &seen[1].sightings {
+                let other = gap(left, right);
+                if best.0 > GATE_SIGMAS && other < best.0 {
+                    best = (other, [left, right]);
+                }
+            }
+        }
+        std::array::from_fn(|k| (seen[k].joints, best.1[k].clone()))
+    }
+
+    /// Moves the heads that have to, by way of the waypoint that takes up the backlash.
+    fn approach(&mut self, moves: &[NextMove; 2]) -> Result<[JointReading; 2], Stop> {
+        let via = moves.map(|m| match m {
+            NextMove::Go { via, .. } => via,
+            NextMove::Hold => None,
+        });
+        if via != [None, None] {
+            self.system.turn(via)?;
+        }
+        let goals = moves.map(|m| match m {
+            NextMove::Go { goal, .. } => Some(goal),
+            NextMove::Hold => None,
+        });
+        Ok(self.system.turn(goals)?)
+    }
+
+    fn nearest_to_centre(&self, side: usize, sightings: Vec<Sighting>) -> Option<Sighting> {
+        let camera = &self.system.heads[side].camera;
+        let centre = nalgebra::Point2::new(camera.cx, camera.cy);
+        let distance = |s: &Sighting| (s.pixel - centre).norm();
+        sightings.into_iter().min_by(|a, b| distance(a).total_cmp(&distance(b)))
+    }
+
+    /// The landmark in the base frame, with equation (1) of the paper beside the exact point.
+    pub(super) fn triangulate(&mut self, held: &[Fixation; 2]) -> Result<GaussianPoint, Stop> {
+        let heads = &self.system.heads;
+        let landmark = triangulate(heads, held, &self.noise())?.point;
+        let axes = [0, 1].map(|k| heads[k].chain.joints[0].parent_from_joint.translation.vector);
+        let baseline = (axes[0] - axes[1]).norm();
+        let angles = PaperAngles::from_pan_tilt(held[0].angles, held[1].angles);
+        let distance = paper_distance(&angles, baseline).unwrap_or(f64::INFINITY);
+        self.landmark = Some(LandmarkReport::new(&landmark, distance));
+        self.observer.notice(&Event::Landmark(&landmark, distance));
+        Ok(landmark)
+    }
+
+    /// Angle noise of the coarser head.
+    pub(super) fn noise(&self) -> Noise {
+        let servos = self.system.robot.heads.iter().map(|head| &head.pan_tilt);
+        servos.fold(Noise { step_sigma: 0.0, common_sigma: 0.0 }, |noise, servo| {
+            let of_servo = Noise::of_servo(servo.resolution(), servo.backlash());
+            Noise {
+                step_sigma: noise.step_sigma.max(of_servo.step_sigma),
+                common_sigma: noise.common_sigma.max(of_servo.common_sigma),
+            }
+        })
+    }
+}
+
+fn fixation(joints: &JointReading, sighting: &Sighting) -> Fixation {
+    Fixation {
+        angles: [joints.pan, joints.tilt],
+        pixel: sighting.pixel,
+        pixel_covariance: sighting.covariance,
+    }
+}

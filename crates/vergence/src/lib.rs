@@ -1,0 +1,17 @@
+//! Find an object by asking it: the orchestration of Vergence over device traits only.
+//!
+//! [`System`] holds a robot's opened devices and its geometry. [`find`] runs the nine steps of the
+//! paper on it: radio, blink, search, centring, triangulation, pictures, recognition. It sees
+//! pixels, encoder angles and radio packets and nothing else; whether wires or the simulator
+//! deliver them is decided by who opened the devices. What happens on the way is told to an
+//! [`Observer`] (progress, pictures, recordings), the outcome is a [`Report`].
+
+pub mod event;
+mod find;
+pub mod report;
+mod system;
+
+pub use event::{Event, Observer};
+pub use find::{FindConfig, Method, find};
+pub use report::Report;
+pub use system::{System, SystemError};

@@ -1,0 +1,115 @@
+//! A robot's opened devices together with its geometry, and the two things that every step does
+//! with them: turn the heads and wait until they are still, take pictures.
+
+use std::time::Duration;
+
+use vergence_devices::{
+    Config, Description, DescriptionError, DeviceError, JointReading, Robot, Side,
+};
+use vergence_head::PanTiltHead;
+use vergence_imaging::Frame;
+
+/// How often moving servos are asked whether they are still.
+const POLL: Duration = Duration::from_millis(10);
+/// Allowance over the time that the slew needs at the joints' rated speed.
+const SLEW_SLACK: Duration = Duration::from_secs(2);
+/// Longest wait for one picture.
+const FRAME_TIMEOUT: Duration = Duration::from_secs(2);
+/// Pictures that may have been exposed before the heads stood still, at the most.
+const STALE_FRAMES: usize = 30;
+
+/// Why a robot could not be put together.
+#[derive(Debug, thiserror::Error)]
+pub enum SystemError {
+    /// The URDF lacks what the configuration names.
+    #[error("{side} head: {source}")]
+    Description {
+        /// Which head.
+        side: &'static str,
+        /// What is wrong.
+        source: DescriptionError,
+    },
+}
+
+/// A robot: devices and geometry.
+pub struct System {
+    /// The opened devices.
+    pub robot: Robot,
+    /// Left and right head: kinematics in the base frame and the camera's lens.
+    pub heads: [PanTiltHead; 2],
+}
+
+impl System {
+    /// Joins opened devices with the geometry of the URDF's link `base`.
+    pub fn new(
+        robot: Robot,
+        config: &Config,
+        description: &Description,
+    ) -> Result<Self, SystemError> {
+        let head = |side: Side| {
+            let wiring = config.head(side);
+            let joints = [wiring.pan_joint.as_str(), wiring.tilt_joint.as_str()];
+            description
+                .chain_with("base", &wiring.optical_frame, &joints)
+                .map(|chain| PanTiltHead { chain, camera: wiring.camera.model() })
+                .map_err(|source| SystemError::Description { side: side.name(), source })
+        };
+        Ok(System { robot, heads: [head(Side::Left)?, head(Side::Right)?] })
+    }
+
+    /// Reads the encoders of both heads.
+    pub fn joints(&mut self) -> Result<[JointReading; 2], DeviceError> {
+        let [left, right] = &mut self.robot.heads;
+        Ok([left.pan_tilt.read()?, right.pan_tilt.read()?])
+    }
+
+    /// Turns the heads that have a target (pan, tilt; rad) and waits until both are still.
+    pub fn turn(
+        &mut self,
+        targets: [Option<[f64; 2]>; 2],
+    ) -> Result<[JointReading; 2], DeviceError> {
+        let before = self.joints()?;
+        let mut longest = Duration::ZERO;
+        for ((head, target), (geometry, from)) in
+            self.robot.heads.iter_mut().zip(targets).zip(self.heads.iter().zip(before))
+        {
+            let Some([pan, tilt]) = target else { continue };
+            head.pan_tilt.move_to(pan, tilt)?;
+            for (joint, turn) in
+                geometry.chain.joints.iter().zip([pan - from.pan, tilt - from.tilt])
+            {
+                let seconds = turn.abs() / joint.limits.velocity.max(0.05);
+                longest = longest.max(Duration::from_secs_f64(seconds));
+            }
+        }
+        let deadline = self.robot.clock.now() + longest + SLEW_SLACK;
+        loop {
+            self.robot.clock.sleep(POLL);
+            let joints = self.joints()?;
+            if joints.iter().all(|j| !j.moving) {
+                return Ok(joints);
+            }
+            if self.robot.clock.now() > deadline {
+                let side = Side::BOTH[usize::from(!joints[0].moving)];
+                return Err(DeviceError::Fault {
+                    device: format!("{} head", side.name()),
+                    fault: "the servos did not reach their goal in time".into(),
+                });
+            }
+        }
+    }
+
+    /// The next picture of one head whose exposure began at or after `since`.
+    pub fn frame_since(&mut self, side: usize, since: Duration) -> Result<Frame, DeviceError> {
+        for _ in 0..STALE_FRAMES {
+            let frame = self.robot.heads[side].camera.next_frame(FRAME_TIMEOUT)?;
+            if frame.stamp >= since {
+                return Ok(frame);
+            }
+        }
+        Err(DeviceError::Fault {
+            device: format!("{} camera", Side::BOTH[side].name()),
+            fault: "its time stamps lie behind the robot's clock".into(),
+        })
+    }
+}
