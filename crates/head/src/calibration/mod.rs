@@ -207,6 +207,18 @@ pub enum CalibrateError {
     /// Numbers that are not finite, or an index of a place that does not exist.
     #[error("unusable input: {0}")]
     Input(&'static str),
+    /// The sightings fit a head that is nowhere near the description: left and right exchanged, or the
+    /// URDF of another head.
+    #[error(
+        "the {head} head would have to differ from its description by {sigmas:.0} times what is \
+         allowed for: check which camera is which, and the URDF"
+    )]
+    FarOff {
+        /// "left" or "right".
+        head: &'static str,
+        /// In standard deviations of the priors.
+        sigmas: f64,
+    },
     /// The adjustment does not converge: the description is too far off, or left and right exchanged.
     #[error(
         "no head near the description explains the sightings ({rms_px:.1} px rms): check joint \
@@ -221,6 +233,9 @@ pub enum CalibrateError {
 fn list(missing: &[Missing]) -> String {
     missing.iter().map(Missing::to_string).collect::<Vec<_>>().join("; ")
 }
+
+/// A change of an unknown by more sigmas of its prior means that the description is of another head.
+const FARTHEST: f64 = 6.0;
 
 /// A calibrated head.
 #[derive(Debug, Clone)]
@@ -261,6 +276,10 @@ pub fn calibrate(
     // Sightings that miss by more than the noise explains are another head, not this one.
     if solution.chi2_mean > solver::EXPLAINED {
         return Err(CalibrateError::NoFit { rms_px: solution.rms_px });
+    }
+    let (sigmas, head) = solution.farthest;
+    if sigmas > FARTHEST {
+        return Err(CalibrateError::FarOff { head: ["left", "right"][head], sigmas });
     }
     let calibration = Calibration {
         heads: solution.heads,

@@ -31,6 +31,8 @@ pub(super) struct Solution {
     pub covariance: DMatrix<f64>,
     pub rms_px: f64,
     pub outliers: f64,
+    /// Largest change of an unknown, in sigmas of its prior, and of which head.
+    pub farthest: (f64, usize),
     /// Mean of the sightings' chi-squared (two degrees of freedom), wrong ones capped.
     pub chi2_mean: f64,
 }
@@ -147,7 +149,11 @@ impl Problem<'_> {
                 counted += 2;
             }
         })?;
+        let sigmas = self.config.priors.sigmas();
+        let change = |k: usize| state.moved[k].component_div(&sigmas).amax();
+        let farther = usize::from(change(1) > change(0));
         Some(Solution {
+            farthest: (change(farther), farther),
             chi2_mean: chi2 / count.max(1) as f64,
             outliers: 1.0 - counted as f64 / 2.0 / count.max(1) as f64,
             rms_px: (squares / counted.max(1) as f64).sqrt(),

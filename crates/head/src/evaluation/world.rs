@@ -1,132 +1,35 @@
-//! How accurate the head is, measured in simulation: the figures of `vergence evaluate head`.
-//!
-//! A head is drawn whose true geometry differs from its description (up to 3 degrees, 10 mm, 10 % of
-//! focal length, evenly). Its servos round to their step, rest anywhere within it, and lag by their
-//! backlash. It is calibrated from a light at unknown places of which some are a known length apart,
-//! then asked how far new lights are, before and after. Only angles as encoders tell them and noisy
-//! pixels reach the mathematics.
+//! The simulated truth behind the figures: a head that differs from its description, its servos, and
+//! what is seen.
 
 use nalgebra::{Matrix2, Point2, Point3, Vector2, Vector3};
-use rand::{RngExt, SeedableRng};
+use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
 use vergence_geometry::{Camera, Chain, Joint, Limits, Ray, Transform, optical_from_body};
 
 use crate::calibration::{
-    Calibration, CalibrationConfig, HEAD_UNKNOWNS, HeadVector, KnownLength, LightPlace, apply,
-    calibrate, middle,
+    Calibration, HEAD_UNKNOWNS, HeadVector, KnownLength, LightPlace, apply, middle,
 };
 use crate::triangulation::nearest_to_rays;
 use crate::{
     Fixation, Fixator, FixatorConfig, NextMove, Noise, PanTiltHead, dither, triangulate_many,
 };
 
-/// A servo as a maker describes it.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct ServoKind {
-    /// Name in the table.
-    pub name: &'static str,
-    /// Step of moves and encoder (rad).
-    pub step: f64,
-    /// Slack of the gears (rad).
-    pub backlash: f64,
-}
-
-/// The paper's servos, and today's with the backlash that their maker states.
-pub const SERVO_KINDS: [ServoKind; 2] = [
-    ServoKind { name: "0.35 degree", step: 0.35 * std::f64::consts::PI / 180.0, backlash: 0.0 },
-    ServoKind {
-        name: "12 bit, 15 arcmin backlash",
-        step: std::f64::consts::TAU / 4096.0,
-        backlash: 0.25 * std::f64::consts::PI / 180.0,
-    },
-];
-
-/// What the calibration knows of the light that it is shown.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum LightSource {
-    /// Moved by hand: unknown places, pairs of which are 0.5 m apart by a ruler read to 0.3 mm.
-    Ruler,
-    /// Held by the arm: places in base known to 0.5 mm.
-    Arm,
-}
-
-/// What is evaluated.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct EvaluationConfig {
-    /// New lights whose distance is measured.
-    pub placements: usize,
-    /// Heads that are drawn and calibrated; the placements are shared out among them.
-    pub heads: usize,
-    /// Baseline (m).
-    pub baseline: f64,
-    /// Distance of the lights (m).
-    pub distance: f64,
-    /// Re-aims per head over which a measurement averages.
-    pub aims: usize,
-    /// Centroid noise (px, one sigma, per coordinate).
-    pub pixel_sigma: f64,
-    /// How the light of the calibration is moved.
-    pub light: LightSource,
-    /// Seed.
-    pub seed: u64,
-}
-
-impl Default for EvaluationConfig {
-    /// The wanted figure: 200 placements 1 m away, baseline 0.2 m.
-    fn default() -> Self {
-        EvaluationConfig {
-            placements: 200,
-            heads: 20,
-            baseline: 0.2,
-            distance: 1.0,
-            aims: 64,
-            pixel_sigma: 0.1,
-            light: LightSource::Ruler,
-            seed: 1,
-        }
-    }
-}
-
-/// Figures of one kind of servo.
-#[derive(Debug, Clone, PartialEq)]
-pub struct ServoFigures {
-    /// Which.
-    pub kind: ServoKind,
-    /// Distance error (m, rms) with the description as it is; lights that got no distance count as an
-    /// error of the whole distance.
-    pub depth_rms_before: f64,
-    /// Lights that got no distance from the description.
-    pub refused_before: usize,
-    /// Distance error (m, rms) after calibration, one fixation a head.
-    pub depth_rms_single: f64,
-    /// Distance error (m, rms) after calibration, `aims` fixations a head.
-    pub depth_rms_after: f64,
-    /// Prediction of held-out sightings with all four joints moving (px, rms over both coordinates),
-    /// encoder and centroid noise included.
-    pub held_out_rms_px: f64,
-    /// The same against the true projection: the calibration's own error.
-    pub model_rms_px: f64,
-    /// Part of the lights whose distance error, free of measurement noise, lies within the predicted
-    /// 95 % interval.
-    pub coverage: f64,
-    /// Heads that the calibration refused.
-    pub refused_calibrations: usize,
-}
+use super::{EvaluationConfig, LightSource, ServoKind, Sums};
 
 /// A true head and what is believed of it.
-struct World {
+pub(super) struct World {
     truth: [PanTiltHead; 2],
-    nominal: [PanTiltHead; 2],
+    pub(super) nominal: [PanTiltHead; 2],
     kind: ServoKind,
     pixel_sigma: f64,
 }
 
 /// What a calibration is given, and where its lights really are.
 #[derive(Default)]
-struct Session {
+pub(super) struct Session {
     lights: Vec<Point3<f64>>,
-    places: Vec<LightPlace>,
-    lengths: Vec<KnownLength>,
+    pub(super) places: Vec<LightPlace>,
+    pub(super) lengths: Vec<KnownLength>,
 }
 
 /// One servo pair: told angles, true angles.
@@ -135,71 +38,12 @@ struct Servos {
     shaft: [f64; 2],
 }
 
-/// Evaluates both kinds of servo.
-pub fn evaluate(config: &EvaluationConfig) -> Vec<ServoFigures> {
-    SERVO_KINDS.iter().map(|kind| evaluate_kind(kind, config)).collect()
-}
-
-/// Evaluates one kind of servo.
-pub fn evaluate_kind(kind: &ServoKind, config: &EvaluationConfig) -> ServoFigures {
-    let mut random = Pcg64Mcg::seed_from_u64(config.seed);
-    let mut sums = Sums::default();
-    let heads = config.heads.clamp(1, config.placements.max(1));
-    for h in 0..heads {
-        let world = World::draw(kind, config, &mut random);
-        let session = world.session(config.light, &mut random);
-        let settings = CalibrationConfig {
-            noise: Noise::of_servo(kind.step, 0.0),
-            ..CalibrationConfig::default()
-        };
-        let calibration = calibrate(&world.nominal, &session.places, &session.lengths, &settings);
-        let share = config.placements / heads + usize::from(h < config.placements % heads);
-        if let Err(e) = &calibration {}
-        let Ok(calibration) = calibration else {
-            sums.refused_calibrations += 1;
-            continue;
-        };
-        world.hold_out(&session, &calibration, &mut random, &mut sums);
-        for _ in 0..share {
-            let light = world.new_light(config.distance, &mut random);
-            world.measure(&light, &calibration, config, &mut random, &mut sums);
-        }
-    }
-    sums.figures(*kind)
-}
-
-#[derive(Default)]
-struct Sums {
-    before: Vec<f64>,
-    refused_before: usize,
-    single: Vec<f64>,
-    after: Vec<f64>,
-    covered: Vec<f64>,
-    held_out: Vec<f64>,
-    model: Vec<f64>,
-    refused_calibrations: usize,
-}
-
-impl Sums {
-    fn figures(&self, kind: ServoKind) -> ServoFigures {
-        let mean = |v: &[f64]| v.iter().sum::<f64>() / v.len().max(1) as f64;
-        let rms = |v: &[f64]| (v.iter().map(|e| e * e).sum::<f64>() / v.len().max(1) as f64).sqrt();
-        ServoFigures {
-            kind,
-            depth_rms_before: rms(&self.before),
-            refused_before: self.refused_before,
-            depth_rms_single: rms(&self.single),
-            depth_rms_after: rms(&self.after),
-            held_out_rms_px: rms(&self.held_out),
-            model_rms_px: rms(&self.model),
-            coverage: mean(&self.covered),
-            refused_calibrations: self.refused_calibrations,
-        }
-    }
-}
-
 impl World {
-    fn draw(kind: &ServoKind, config: &EvaluationConfig, random: &mut Pcg64Mcg) -> World {
+    pub(super) fn draw(
+        kind: &ServoKind,
+        config: &EvaluationConfig,
+        random: &mut Pcg64Mcg,
+    ) -> World {
         let nominal = described_heads(config.baseline);
         let truth = [0, 1].map(|k| {
             let mut change = HeadVector::zeros();
@@ -219,29 +63,28 @@ impl World {
     }
 
     /// A light this far from the middle of the true head, within easy reach.
-    fn new_light(&self, distance: f64, random: &mut Pcg64Mcg) -> Point3<f64> {
+    pub(super) fn new_light(&self, distance: f64, random: &mut Pcg64Mcg) -> Point3<f64> {
         let pan: f64 = random.random_range(-0.5..0.5);
         let tilt: f64 = random.random_range(-0.1..0.6);
         let direction = Vector3::new(tilt.cos() * pan.cos(), tilt.cos() * pan.sin(), -tilt.sin());
         middle(&self.truth) + direction * distance
     }
 
-    /// What the calibration is given: a light at 20 places, pairs of which are 0.4 m apart by a ruler
-    /// that is read to 0.3 mm; at every place each head looks at it and twelve times past it.
-    fn session(&self, source: LightSource, random: &mut Pcg64Mcg) -> Session {
-        const PAIRS: usize = 12;
-        const VIEWS: usize = 48;
+    /// What the calibration is given: the light at some places, seen by each head from angles that
+    /// bring it all over the picture. The places are known from the arm, or pairs of them are a ruler's
+    /// length apart.
+    pub(super) fn session(&self, config: &EvaluationConfig, random: &mut Pcg64Mcg) -> Session {
         const ARM: f64 = 0.0005;
         const RULER: (f64, f64) = (0.5, 0.0003);
         let mut session = Session::default();
-        for pair in 0..PAIRS {
+        for pair in 0..config.places.div_ceil(2) {
             let distance = random.random_range(0.6..1.5);
             let first = self.new_light(distance, random);
             // Along a table's edge: sideways and a little to the back.
             let turn: f64 = random.random_range(-0.7..0.7);
             let second = first + Vector3::new(turn.sin(), turn.cos(), 0.0) * RULER.0;
             let length = RULER.0 + RULER.1 * normal(random);
-            if source == LightSource::Ruler {
+            if config.light == LightSource::Ruler {
                 session.lengths.push(KnownLength {
                     places: [2 * pair, 2 * pair + 1],
                     length,
@@ -250,8 +93,8 @@ impl World {
             }
             for light in [first, second] {
                 let fixations =
-                    [0, 1].map(|k| self.look_around(k, &light, VIEWS, [0.35, 0.25], random));
-                let known = (source == LightSource::Arm).then(|| {
+                    [0, 1].map(|k| self.look_around(k, &light, config.views, [0.35, 0.25], random));
+                let known = (config.light == LightSource::Arm).then(|| {
                     let shake = Vector3::from_fn(|_, _| normal(random)) * ARM;
                     (light + shake, ARM)
                 });
@@ -342,7 +185,7 @@ impl World {
     }
 
     /// Distances of one new light, before and after calibration.
-    fn measure(
+    pub(super) fn measure(
         &self,
         light: &Point3<f64>,
         calibration: &Calibration,
@@ -403,7 +246,7 @@ impl World {
     }
 
     /// Predicts sightings of the calibration's lights from new angles of all joints.
-    fn hold_out(
+    pub(super) fn hold_out(
         &self,
         session: &Session,
         calibration: &Calibration,
@@ -416,15 +259,6 @@ impl World {
                     let predicted = calibration.heads[k].project(seen.angles, found);
                     let Some(predicted) = predicted else { continue };
                     let off = predicted - seen.pixel;
-                    if off.norm() > 5.0 {
-                        eprintln!(
-                            session
-                                .places
-                                .iter()
-                                .map(|p| [p.fixations[0].len(), p.fixations[1].len()])
-                                .collect::<Vec<_>>()
-                        );
-                    }
                     sums.held_out.extend([off.x, off.y]);
                     let slack = self.kind.backlash / 2.0;
                     let shaft = seen.angles.map(|a| a - slack);
@@ -464,7 +298,7 @@ impl Servos {
 }
 
 /// The head as described: lever arms of some centimetres, 320x240 pixels, 0.5 m above base.
-fn described_heads(baseline: f64) -> [PanTiltHead; 2] {
+pub(super) fn described_heads(baseline: f64) -> [PanTiltHead; 2] {
     [baseline / 2.0, -baseline / 2.0].map(|y| {
         let joint = |name: &str, origin: [f64; 3], axis, lower, upper| Joint {
             name: name.into(),
