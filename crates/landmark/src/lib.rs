@@ -12,5 +12,6 @@
 mod finder;
 pub mod paper;
 pub mod sequential;
+pub mod synthetic;
 
 pub use finder::{Decision, Finder, FinderError, Request, Sighting};

@@ -1,7 +1,7 @@
 //! Robot and tags over the virtual air: what a robot does with tags, on virtual time.
 
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
 use vergence_devices::{Clock, DeviceError, LedCommand, TagAddress, TagLink};

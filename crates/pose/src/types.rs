@@ -15,7 +15,8 @@ pub struct View<'a> {
     /// Pose of the camera's optical frame in the base frame.
     pub base_from_optical: Transform,
     /// Standard deviation of a small turn of the camera about its own x and y axes (rad): how well
-    /// the head's angles are known. Zero when exactly.
+    /// the head's angles are known. Zero when exactly. When it is not zero, the landmark is taken
+    /// to have been triangulated from these very views, so that its error and theirs are one.
     pub turn_sd: f64,
 }
 

@@ -304,3 +304,96 @@ fn erf(x: f64) -> f64 {
                 + t * (1.421_413_741 + t * (-1.453_152_027 + t * 1.061_405_429))));
     (1.0 - series * (-x * x).exp()).copysign(x)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::{Body, Material};
+    use crate::trace::{Solid, Texture};
+    use nalgebra::{Translation3, Unit};
+    use vergence_geometry::optical_from_body;
+
+    /// A camera at the origin that looks along +x, and a light at 1 m that faces it.
+    fn frame_with(bodies: Vec<Body>, lit: bool) -> Image<f32> {
+        frame_at(bodies, if lit { 0.1 } else { 1.1 }, 0.0)
+    }
+
+    /// The light is on in the first second and dark in the next.
+    fn frame_at(bodies: Vec<Body>, start: f64, row_time: f64) -> Image<f32> {
+        let emitter = Emitter {
+            position: Point3::new(1.0, 0.05, -0.02),
+            normal: Unit::new_normalize(Vector3::new(-1.0, 0.0, 0.0)),
+            lobe: 1.0,
+            diameter: 0.003,
+            flux_px: 2.0,
+        };
+        let pattern = vergence_tag::Pattern::new(
+            vergence_tag::pattern::Bits::FLICKER,
+            std::time::Duration::from_secs(1),
+        )
+        .unwrap();
+        let play = Play { begin: 0.0, end: f64::INFINITY, pattern, rate: 1.0 };
+        let pose = Transform::from_parts(Translation3::identity(), optical_from_body().inverse());
+        let capture = Capture {
+            sequence: 0,
+            start,
+            base_from_optical: [pose; 2],
+            blinkers: vec![Blinker { emitter, plays: vec![play] }],
+            stage: Arc::new(Stage::new(Scene { bodies, ..Scene::default() })),
+        };
+        let lens = Lens::centred(320, 240, 300.0);
+        let light = LightSettings::default();
+        let settings = CameraSettings { row_time, ..CameraSettings::default() };
+        let mut sensor = Sensor::new(lens, settings, &light, 1, 0);
+        sensor.picture(&capture);
+        sensor.expose(&capture)
+    }
+
+    fn total(image: &Image<f32>) -> f32 {
+        image.data().iter().sum()
+    }
+
+    fn wall_at(x: f64, z: f64) -> Body {
+        let matt = Material::matt(0.5, Texture::Plain, 1);
+        let place = Transform::translation(x, 0.05, z);
+        Body::new(Solid::Box([0.01, 0.05, 0.05]), &place, matt)
+    }
+
+    #[test]
+    fn a_body_in_between_hides_the_light() {
+        // Nearly on the axis: cos is 0.9986, the squared distance 1.0029.
+        let open = total(&frame_with(vec![], true));
+        assert!((open - 2.0 * 0.9986 / 1.0029).abs() < 2e-3, "{open}");
+        assert_eq!(total(&frame_with(vec![], false)), 0.0, "dark chip");
+        assert_eq!(total(&frame_with(vec![wall_at(0.5, -0.01)], true)), 0.0, "hidden");
+        assert_eq!(total(&frame_with(vec![wall_at(1.2, -0.01)], true)), open, "behind");
+        // The wall's upper edge passes through the middle of the disc as the camera sees it.
+        let half = total(&frame_with(vec![wall_at(0.99, -0.0198 - 0.05)], true));
+        assert!(half > 0.2 * open && half < 0.8 * open, "half hidden: {half} of {open}");
+    }
+
+    #[test]
+    fn a_rolling_shutter_exposes_the_lights_row_later() {
+        // The light is seen in row 126; 0.1 ms a row, that is 12.6 ms after the first row.
+        let first_row = 0.992;
+        assert!(total(&frame_at(vec![], first_row, 0.0)) > 1.9, "whole exposure lit");
+        assert_eq!(total(&frame_at(vec![], first_row, 1e-4)), 0.0, "after the light went out");
+        let half = total(&frame_at(vec![], 0.998 - 0.012_55, 1e-4));
+        assert!((half - 1.0).abs() < 0.1, "goes out in the middle of the row's exposure: {half}");
+    }
+
+    #[test]
+    fn noise_follows_the_settings() {
+        let lens = Lens::centred(320, 240, 300.0);
+        let settings = CameraSettings { gamma: 1.0, ..CameraSettings::default() };
+        let sensor = Sensor::new(lens, settings, &LightSettings::default(), 1, 0);
+        let picture = sensor.digitise(&Image::filled(320, 240, 0.25), 7);
+        let values: Vec<f64> = picture.data().iter().map(|p| f64::from(*p)).collect();
+        let mean = values.iter().sum::<f64>() / values.len() as f64;
+        let variance = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / values.len() as f64;
+        // 3000 electrons of shot noise and 8 of read noise; rounding adds 1/12.
+        let expected = (255.0f64 / 12000.0).powi(2) * (3000.0 + 64.0) + 1.0 / 12.0;
+        assert!((mean - 63.75).abs() < 0.05, "mean {mean}");
+        assert!((variance / expected - 1.0).abs() < 0.03, "{variance} for {expected}");
+    }
+}

@@ -104,10 +104,6 @@ impl PanTilt for SimPanTilt {
     }
 
     fn backlash(&self) -> f64 {
-<<<<<<< HEAD
-        lock(&self.world).settings.servos.backlash_deg.to_radians()
-=======
         lock(&self.world).heads[self.side as usize].servos[0].backlash()
->>>>>>> main
     }
 }

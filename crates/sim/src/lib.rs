@@ -6,7 +6,8 @@
 //! nothing of it passes through the devices.
 //!
 //! Equal configuration, seed and sequence of calls give equal bytes. What is simulated and how is
-//! said in the modules: [`trace`] (light), [`camera`] (sensor), [`servo`], [`radio`], [`lights`].
+//! said in the private modules: `trace` (light), `camera` (sensor), `servo`, `radio`, `lights`.
+//! [`stereo_scene`] gives single stereo pairs with their truth, for measuring pose recognition.
 
 mod camera;
 mod config;
@@ -18,6 +19,7 @@ mod placement;
 mod radio;
 mod scene;
 mod servo;
+mod stereo_scene;
 mod trace;
 mod workcell;
 mod world;
@@ -27,6 +29,7 @@ pub use config::{
     Scenario, ServoSettings, SimConfig, Surface,
 };
 pub use error::SimError;
+pub use stereo_scene::{StereoScene, stereo_scene};
 pub use workcell::{TrueCamera, TrueObject, Truth, Workcell, embedded_files, settings};
 
 /// The embedded robot's description.

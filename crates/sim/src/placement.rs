@@ -20,8 +20,10 @@ use crate::trace::{LANES, Placed, Solid, Texture, V3, is_clear};
 const TABLE: [f64; 3] = [0.15, 1.35, 0.9];
 /// Where objects may stand (m, base).
 const FIELD: [f64; 3] = [0.42, 1.05, 0.6];
-/// Attempts to find a place before giving up.
-const ATTEMPTS: usize = 4000;
+/// Attempts to find a place for one thing before giving up.
+const ATTEMPTS: usize = 1000;
+/// Arrangements that are begun before giving up.
+const ARRANGEMENTS: u64 = 20;
 
 /// What the composition needs to know of a head: its camera at rest.
 #[derive(Debug, Clone, Copy)]
@@ -64,13 +66,29 @@ pub struct Composition {
     pub status: Option<Emitter>,
 }
 
-/// Composes the scene of a seed.
+/// Composes the scene of a seed. An arrangement that leaves no place for something is begun anew.
 pub fn compose(
     config: &SimConfig,
     views: &[RestView; 2],
     seed: u64,
 ) -> Result<Composition, SimError> {
-    let mut rng = stream(seed, "placement", 0);
+    let mut last = compose_once(config, views, stream(seed, "placement", 0));
+    for attempt in 1..ARRANGEMENTS {
+        match last {
+            Err(SimError::NoPlace(_)) => {
+                last = compose_once(config, views, stream(seed, "placement", attempt));
+            }
+            settled => return settled,
+        }
+    }
+    last
+}
+
+fn compose_once(
+    config: &SimConfig,
+    views: &[RestView; 2],
+    mut rng: Pcg64Mcg,
+) -> Result<Composition, SimError> {
     let mut builder = Builder {
         scene: room(&config.light, &mut rng),
         taken: Vec::new(),
@@ -189,7 +207,7 @@ fn tag_housing(site: &LandmarkSite, base_from_object: &Transform) -> Body {
 
 fn material(surface: Surface, solid: &Solid, rng: &mut Pcg64Mcg) -> Material {
     let seed: u32 = rng.random();
-    let albedo = rng.random_range(0.35..0.75f32);
+    let albedo = rng.random_range(0.2..0.75f32);
     let (around, height) = match *solid {
         Solid::Frustum { bottom, top, half } | Solid::Cup { bottom, top, half, .. } => {
             (std::f32::consts::PI * (bottom + top), 2.0 * half)
@@ -213,7 +231,7 @@ fn room(light: &LightSettings, rng: &mut Pcg64Mcg) -> Scene {
         body
     };
     let seed: u32 = rng.random();
-    let wood = Material::matt(0.42, Texture::Wood, seed).glossy(0.035);
+    let wood = Material::matt(0.34, Texture::Wood, seed).glossy(0.035);
     let wall = |albedo, k| Material::matt(albedo, Texture::Backdrop, seed.wrapping_add(k));
     let floor = Material::matt(0.2, Texture::Grain { size: 0.3, contrast: 0.6 }, seed);
     let half_x = (0.5 * (TABLE[1] - TABLE[0])) as f32;
@@ -241,17 +259,17 @@ fn room(light: &LightSettings, rng: &mut Pcg64Mcg) -> Scene {
         Lamp {
             centre: at(rng.random_range(0.3..0.9), rng.random_range(0.1..0.6), 2.2),
             edges: [[0.6, 0.0, 0.0], [0.0, 0.06, 0.0]],
-            intensity: 3.0 * b,
+            intensity: 2.4 * b,
             layer: Layer::Lamp,
         },
         Lamp {
             centre: at(rng.random_range(-0.2..0.5), -1.9, 1.3),
-            edges: [[0.5, 0.0, 0.0], [0.0, 0.0, 0.5]],
-            intensity: 2.0 * b,
+            edges: [[0.16, 0.0, 0.0], [0.0, 0.0, 0.22]],
+            intensity: 5.0 * b,
             layer: Layer::Steady,
         },
     ];
-    Scene { bodies, lamps, ambient: [0.28 * b, 0.12 * b], table_height: 0.0 }
+    Scene { bodies, lamps, ambient: [0.1 * b, 0.06 * b], table_height: 0.0 }
 }
 
 struct Builder {
@@ -399,7 +417,7 @@ impl Builder {
             let half = [
                 rng.random_range(0.012..0.03),
                 rng.random_range(0.02..0.05),
-                rng.random_range(0.03..0.09f64),
+                rng.random_range(0.02..0.09f64),
             ];
             let away = rng.random_range(0.06..0.16);
             let along = (-p.y).atan2(-p.x) + rng.random_range(-0.9..0.9);

@@ -9,6 +9,7 @@
 
 pub mod beacon;
 pub mod cbor;
+pub mod codebook;
 pub mod command;
 pub mod gatt;
 pub mod pattern;

@@ -74,7 +74,7 @@ enum Stop {
     WrongRecord { advertised: String, recorded: String },
     #[error("the tag answers, but its light was not seen in {views} views by {missing}")]
     NotSeen { views: usize, missing: &'static str },
-    #[error("the light was seen by the {0} head and lost while it was centred")]
+    #[error("the light that the {0} head saw was lost or did not obey when it was centred")]
     Lost(&'static str),
     #[error("the two heads do not see one and the same light: {0}")]
     Triangulation(#[from] vergence_head::TriangulateError),
@@ -98,7 +98,9 @@ impl Stop {
             Stop::NotSeen { .. } => {
                 "turn the object so that its landmark faces the cameras, or remove what hides it"
             }
-            Stop::Lost(_) => "keep the object still while it is being found, then try again",
+            Stop::Lost(_) => {
+                "keep the object still while it is being found; something else may blink like the tag"
+            }
             Stop::Triangulation(_) => {
                 "look for mirrors near the object; if it happens everywhere, calibrate the heads"
             }
@@ -167,7 +169,7 @@ impl Run<'_> {
         let tag = self.step("radio", |run| run.radio(object))?;
         let record = self.step("record", |run| run.record(&tag))?;
         let pattern = self.step("blink", |run| run.start_blinking(tag.address))?;
-        let landmark = self.locate(&pattern);
+        let landmark = self.locate(tag.address, pattern);
         // The light must go out whether or not it was seen: for the pictures, and for the battery.
         let stopped = self.step("stop", |run| run.command(tag.address, LedCommand::Stop));
         let (landmark, angles) = landmark?;
@@ -177,9 +179,14 @@ impl Run<'_> {
     }
 
     /// Search, centring and triangulation, while the light blinks.
-    fn locate(&mut self, pattern: &Pattern) -> Result<(GaussianPoint, [[f64; 2]; 2]), Stop> {
-        let seen = self.step("search", |run| run.search(pattern))?;
-        let held = self.step("centre", |run| run.centre(pattern, seen))?;
+    fn locate(
+        &mut self,
+        tag: TagAddress,
+        pattern: Pattern,
+    ) -> Result<(GaussianPoint, [[f64; 2]; 2]), Stop> {
+        let seen = self.step("search", |run| run.search(&pattern))?;
+        let challenge = self.step("challenge", |run| run.challenge(tag, pattern))?;
+        let held = self.step("centre", |run| run.centre(&challenge, seen))?;
         let landmark = self.step("triangulate", |run| run.triangulate(&held))?;
         Ok((landmark, held.map(|fixation| fixation.angles)))
     }

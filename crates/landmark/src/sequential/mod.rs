@@ -53,8 +53,9 @@ pub struct Config {
     pub wrong_identity: f64,
     /// A tag of this contrast (grey levels) would have been found before "absent" is said.
     pub least_contrast: f64,
-    /// Blinkers whose clock differs by this much (relative) and more are told from the tag.
-    pub foreign_rate: f64,
+    /// Blinkers whose clock differs by this much (relative) and more are told from the tag. It costs
+    /// the time in which that difference shows; `None` where nothing foreign can blink a code.
+    pub foreign_rate: Option<f64>,
 }
 
 impl Default for Config {
@@ -64,7 +65,7 @@ impl Default for Config {
             false_alarm: 1e-3,
             wrong_identity: 1e-3,
             least_contrast: 3.0,
-            foreign_rate: 0.04,
+            foreign_rate: Some(0.04),
         }
     }
 }

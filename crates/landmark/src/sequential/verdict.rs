@@ -84,11 +84,11 @@ impl<'a> Banks<'a> {
         })
     }
 
-    fn foreign(&mut self, request: usize) -> &Bank {
+    fn foreign(&mut self, request: usize, rate: f64) -> &Bank {
         let round = self.round;
         self.foreign.entry(request).or_insert_with(|| {
             let r = &round.requests[request];
-            let gap = round.config.foreign_rate + r.clock_tolerance;
+            let gap = rate + r.clock_tolerance;
             let rates: Vec<f64> =
                 FOREIGN.iter().flat_map(|k| [1.0 / (1.0 + k * gap), 1.0 + k * gap]).collect();
             Bank::with_rates(&r.pattern, &rates, &round.times, round.nuisance)
@@ -280,7 +280,8 @@ impl Round<'_> {
                 _ => {}
             }
         }
-        let bank = banks.foreign(request);
+        let Some(rate) = self.config.foreign_rate else { return true };
+        let bank = banks.foreign(request, rate);
         let limit = own.log_ratio - self.margin(bank.hypotheses.len());
         let foreign = weigh(series, bank, limit, &mut scratch);
         foreign.is_none_or(|evidence| evidence.log_ratio <= limit)

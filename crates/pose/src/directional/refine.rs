@@ -11,7 +11,7 @@
 //! are eliminated view by view (Schur complement). The foot of a standing object, where the shadow
 //! begins, is measured only coarsely.
 
-use nalgebra::{Matrix3, Matrix6, SMatrix, SVector, Vector3};
+use nalgebra::{Matrix3, Matrix6, Point3, SMatrix, SVector, Vector2, Vector3};
 use vergence_geometry::Transform;
 use vergence_geometry::gaussian::{perturb, skew};
 
@@ -39,6 +39,8 @@ pub fn absence(kind: Kind) -> f64 {
     }
 }
 
+/// Deviation of the pixel where a camera saw the landmark, lobe and housing included (px).
+const LANDMARK_SD_PX: f64 = 0.3;
 /// Deviation of an object's true form from its record (m): rounded edges, seams, bulging sides.
 const FORM_SD: f64 = 0.0006;
 /// Deviation of the foot's edge (m): contact shadows hide where the object ends.
@@ -167,6 +169,17 @@ impl Search<'_> {
         let mut now = refined.clone_state();
         now.apply(moved);
         let (mut a, mut b) = self.prior(&now);
+        for (view, n) in normals.iter_mut().enumerate() {
+            let Some((residual, by_shared, by_own)) = self.landmark_pixel(&now, view) else {
+                continue;
+            };
+            let weight = LANDMARK_SD_PX.powi(-2);
+            n.shared += by_shared.transpose() * weight * by_shared;
+            n.mixed += by_shared.transpose() * weight * by_own;
+            n.own += by_own.transpose() * weight * by_own;
+            n.shared_rhs += by_shared.transpose() * weight * residual;
+            n.own_rhs += by_own.transpose() * weight * residual;
+        }
         let mut eliminated = Vec::with_capacity(normals.len());
         for (view, n) in normals.iter_mut().enumerate() {
             let precision = self.nuisance_precision(view);
@@ -202,10 +215,53 @@ impl Search<'_> {
         (self.query.landmark.position.coords - centre - lever, j)
     }
 
+    /// Whether the landmark holds the cameras' angles: it was triangulated from these very views,
+    /// so its error *is* theirs, and what is certain is the pixel where each camera saw it.
+    fn landmark_is_pixels(&self) -> bool {
+        self.sights.len() > 1 && self.sights.iter().all(|s| s.view.turn_sd > 0.0)
+    }
+
+    /// Residual (px) of the landmark in a view and its derivatives by the shared and own unknowns.
+    fn landmark_pixel(
+        &self,
+        state: &Refined,
+        view: usize,
+    ) -> Option<(Vector2<f64>, SMatrix<f64, 2, 7>, SMatrix<f64, 2, 3>)> {
+        if !self.landmark_is_pixels() {
+            return None;
+        }
+        let sight = &self.sights[view];
+        let seen = sight.optical_from_base * self.query.landmark.position;
+        let seen = sight.view.camera.project(&seen)?;
+        let turn = state.nuisances[view].0;
+        let turned = Transform::rotation(Vector3::new(turn.x, turn.y, 0.0));
+        let optical_from_base = turned * sight.optical_from_base;
+        let lever = state.pose.rotation * self.landmark * state.log_size.exp();
+        let p = optical_from_base * Point3::from(state.pose.translation.vector + lever);
+        let (pixel, by_point) = sight.view.camera.project_with_jacobian(&p)?;
+        let by_base = by_point * optical_from_base.rotation.to_rotation_matrix();
+        let mut by_shared = SMatrix::<f64, 2, 7>::zeros();
+        by_shared.fixed_view_mut::<2, 3>(0, 0).copy_from(&(by_base * -skew(&lever)));
+        by_shared.fixed_view_mut::<2, 3>(0, 3).copy_from(&by_base);
+        by_shared.fixed_view_mut::<2, 1>(0, 6).copy_from(&(by_base * lever));
+        let by_turn = by_point * -skew(&p.coords);
+        let mut by_own = SMatrix::<f64, 2, 3>::zeros();
+        by_own.fixed_view_mut::<2, 2>(0, 0).copy_from(&by_turn.fixed_view::<2, 2>(0, 0));
+        Some((seen - pixel, by_shared, by_own))
+    }
+
+    /// What the landmark's measurement is worth as a point (1/m^2).
+    fn landmark_weight(&self) -> Matrix3<f64> {
+        match self.landmark_is_pixels() {
+            true => Matrix3::zeros(),
+            false => self.query.landmark.covariance.try_inverse().unwrap_or_default(),
+        }
+    }
+
     /// Information and right-hand side of the landmark, of gravity and of the size.
     fn prior(&self, state: &Refined) -> (Matrix7, Vector7) {
         let (residual, j) = self.landmark_residual(state);
-        let weight = self.query.landmark.covariance.try_inverse().unwrap_or_default();
+        let weight = self.landmark_weight();
         let (mut a, mut b) = (j.transpose() * weight * j, j.transpose() * weight * residual);
         if let Some(turn) = self.tilt(&state.pose) {
             // Only the two turns that tilt the axis are measured, not the one about it.
@@ -226,7 +282,7 @@ impl Search<'_> {
     /// Half the squared normalised residuals of all priors.
     fn strain(&self, state: &Refined) -> f64 {
         let (residual, _) = self.landmark_residual(state);
-        let weight = self.query.landmark.covariance.try_inverse().unwrap_or_default();
+        let weight = self.landmark_weight();
         let landmark = (residual.transpose() * weight * residual).x;
         let size = (state.log_size / SIZE_SD).powi(2);
         let tilt = self.tilt(&state.pose).map_or(0.0, |t| (t.norm() / STANDING_SD).powi(2));
@@ -236,7 +292,11 @@ impl Search<'_> {
                 n.component_mul(&n).dot(&self.nuisance_precision(v))
             })
             .sum();
-        0.5 * (landmark + size + tilt + own)
+        let pixels: f64 = (0..state.nuisances.len())
+            .filter_map(|v| self.landmark_pixel(state, v))
+            .map(|(residual, ..)| (residual / LANDMARK_SD_PX).norm_squared())
+            .sum();
+        0.5 * (landmark + size + tilt + own + pixels)
     }
 
     /// The small turn (base frame) that would make the object stand exactly, when it seems to.

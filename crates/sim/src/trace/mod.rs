@@ -8,6 +8,9 @@
 //! lamps, each probed with four shadow rays whose targets are interleaved over 2x2 pixels; pixels
 //! where the body or the surface changes against a neighbour are sampled eight times over.
 
+// One index runs over the lanes of several arrays at once; iterators would hide that.
+#![allow(clippy::needless_range_loop)]
+
 mod lightmap;
 mod packet;
 mod render;

@@ -255,3 +255,90 @@ fn at_edge(surface: &Image<u64>, x: usize, y: usize) -> bool {
     let around = [(x + 1, y), (x.wrapping_sub(1), y), (x, y + 1), (x, y.wrapping_sub(1))];
     around.iter().any(|&(x, y)| surface.get(x, y).is_some_and(|other| Some(other) != here))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::{Body, Layer, Material};
+    use crate::trace::{Solid, Texture};
+    use nalgebra::Point3;
+
+    /// Covered area and centroid of a single glowing body.
+    fn silhouette(solid: Solid, at: Point3<f64>, lens: &Camera) -> (f64, Point2<f64>) {
+        let glowing = Material { glow: 1.0, ..Material::matt(0.5, Texture::Plain, 0) };
+        let mut body = Body::new(solid, &Transform::translation(at.x, at.y, at.z), glowing);
+        body.shadow = false;
+        let stage = Stage::new(Scene { bodies: vec![body], ..Scene::default() });
+        let out = render(&stage, &RayGrid::new(lens), &Transform::identity());
+        let image = &out[Layer::Screen as usize];
+        let (mut area, mut u, mut v) = (0.0, 0.0, 0.0);
+        for y in 0..image.height() {
+            for (x, &value) in image.row(y).iter().enumerate() {
+                // The plain texture still has a little grain: coverage is what counts.
+                let value = f64::from(value / 0.5).min(1.0);
+                (area, u, v) = (area + value, u + value * x as f64, v + value * y as f64);
+            }
+        }
+        (area, Point2::new(u / area, v / area))
+    }
+
+    fn lens() -> Camera {
+        Camera {
+            distortion: vergence_geometry::Distortion { k1: -0.1, ..Default::default() },
+            ..Camera::centred(320, 240, 300.0)
+        }
+    }
+
+    #[test]
+    fn silhouettes_agree_with_the_projection() {
+        // A small ball is seen where its centre projects; a thin plate covers its projected area.
+        for at in [Point3::new(0.0, 0.0, 0.8), Point3::new(0.25, -0.15, 0.8)] {
+            let (area, centre) = silhouette(Solid::Sphere(0.02), at, &lens());
+            let expected = lens().project(&at).unwrap();
+            assert!((centre - expected).norm() < 0.1, "{centre} for {expected}, area {area}");
+        }
+        let at = Point3::new(0.1, 0.05, 0.7);
+        let (area, _) = silhouette(Solid::Box([0.1, 0.06, 1e-4]), at, &lens());
+        let corner = |x, y| lens().project(&(at + nalgebra::Vector3::new(x, y, 0.0))).unwrap();
+        // Shoelace over the outline, which distortion bends.
+        let side = |k: usize, t: f64| match k {
+            0 => corner(-0.1 + 0.2 * t, -0.06),
+            1 => corner(0.1, -0.06 + 0.12 * t),
+            2 => corner(0.1 - 0.2 * t, 0.06),
+            _ => corner(-0.1, 0.06 - 0.12 * t),
+        };
+        let outline: Vec<_> =
+            (0..4).flat_map(|k| (0..50).map(move |j| side(k, f64::from(j) / 50.0))).collect();
+        let expected: f64 = (0..200)
+            .map(|i| (outline[i], outline[(i + 1) % 200]))
+            .map(|(a, b)| 0.5 * (a.x * b.y - a.y * b.x))
+            .sum();
+        // The grain of the surface is 4 %, at most 2 % on average.
+        assert!((area / expected - 1.0).abs() < 0.03, "{area} px for {expected}");
+    }
+
+    #[test]
+    fn a_lamp_throws_a_shadow() {
+        let lamp = crate::scene::Lamp {
+            centre: [0.0, 0.0, 2.0],
+            edges: [[0.05, 0.0, 0.0], [0.0, 0.05, 0.0]],
+            intensity: 2.0,
+            layer: Layer::Lamp,
+        };
+        let matt = Material::matt(0.5, Texture::Plain, 0);
+        let mut table =
+            Body::new(Solid::Box([0.5, 0.5, 0.02]), &Transform::translation(0.0, 0.0, -0.02), matt);
+        (table.shadow, table.mirror) = (false, true);
+        let plate =
+            Body::new(Solid::Box([0.1, 0.1, 0.001]), &Transform::translation(0.0, 0.0, 0.5), matt);
+        let scene = Scene { bodies: vec![table, plate], lamps: vec![lamp], ..Scene::default() };
+        let stage = Stage::new(scene);
+        // From below the plate, looking down: the middle is dark, the rim is lit.
+        let down = nalgebra::UnitQuaternion::from_euler_angles(std::f64::consts::PI, 0.0, 0.0);
+        let pose = Transform::from_parts(Point3::new(0.0, 0.0, 0.45).coords.into(), down);
+        let grid = RayGrid::new(&Camera::centred(320, 240, 150.0));
+        let light = &render(&stage, &grid, &pose)[Layer::Lamp as usize];
+        let (middle, rim) = (light.sample(160.0, 120.0), light.sample(10.0, 120.0));
+        assert!(middle < 0.01 * rim && rim > 0.1, "{middle} in the shadow, {rim} outside");
+    }
+}

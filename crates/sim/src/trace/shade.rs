@@ -164,9 +164,10 @@ fn surfaces(scene: &Scene, packet: &Packet, pixel: f32) -> [Surface; LANES] {
         };
         *s = Surface { point, normal, view, albedo: 0.0, body: index, kind };
     }
-    let mut footprint = packet.t;
-    for f in &mut footprint {
-        *f *= pixel;
+    // A pixel is longer on a surface that is seen at a flat angle.
+    let mut footprint = [0.0; LANES];
+    for (i, s) in surfaces.iter().enumerate() {
+        footprint[i] = packet.t[i] * pixel / (-dot(s.view, s.normal)).max(0.25);
     }
     // Textures of all eight lanes at once; packets rarely show more than one body.
     let mut done = [false; LANES];
@@ -299,17 +300,8 @@ fn illuminate(
 ) {
     between(scene, cluster.centre, cluster.spread, lamp, near);
     for probe in 0..4 {
-<<<<<<< HEAD
         let mut packet = Packet::idle();
         for (i, s) in surfaces.iter().enumerate().filter(|(_, s)| s.kind == Kind::Object) {
-=======
-        let (mut origin, mut direction) =
-            ([[0.0; LANES]; 3], [[0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0]; 3]);
-        let mut reach = [0.0; LANES];
-        for (i, s) in surfaces.iter().enumerate().filter(|(_, s)| s.hit) {
-            let [u, v] = PROBES[usize::from(phase[i] & 3)][probe];
-            let target = add_scaled(add_scaled(lamp.centre, lamp.edges[0], u), lamp.edges[1], v);
->>>>>>> main
             let from = add_scaled(s.point, s.normal, NEAR);
             packet.aim(i, from, lamp_point(lamp, usize::from(phase[i]), probe));
         }
@@ -320,23 +312,6 @@ fn illuminate(
                 let strength = 0.25 * lamp.intensity / (reach[i] * reach[i]).max(0.1);
                 light[i][lamp.layer as usize] += strength * response(scene, s, packet.heading(i));
             }
-<<<<<<< HEAD
-=======
-            let material = &scene.bodies[s.body].material;
-            let strength = 0.25 * lamp.intensity / (reach[i] * reach[i]).max(1e-3);
-            let mirrored = add_scaled(s.view, s.normal, -2.0 * dot(s.view, s.normal));
-            let shine = match material.gloss > 0.0 {
-                true => {
-                    let along = dot(mirrored, d).max(0.0);
-                    material.gloss
-                        * 0.5
-                        * (material.shininess + 2.0)
-                        * along.powf(material.shininess)
-                }
-                false => 0.0,
-            };
-            light[i][lamp.layer as usize] += strength * cos * (s.albedo + shine);
->>>>>>> main
         }
     }
 }

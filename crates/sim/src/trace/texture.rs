@@ -206,23 +206,6 @@ impl Texture {
     fn drawn(&self, p: V3, n: V3, extent: Extent, footprint: f32, seed: u32) -> f32 {
         let flat = (0..3).fold(0, |best, k| if n[k].abs() > n[best].abs() { k } else { best });
         match *self {
-<<<<<<< HEAD
-=======
-            Texture::Plain => 1.0 + 0.04 * grain(p, 0.03, 2, footprint, seed),
-            Texture::Grain { size, contrast } => {
-                (1.0 + contrast * grain(p, size, 4, footprint, seed)).max(0.05)
-            }
-            Texture::Wood => {
-                let board = (p[1] / 0.14).floor() as i32;
-                let tone = 0.12 * (lattice(board, 0, 0, seed) - 0.5);
-                let joint =
-                    1.0 - 0.5 * bar(-0.001, 0.001, p[1] - (p[1] / 0.14).round() * 0.14, footprint);
-                let fibre = [p[0] * 0.12, p[1] + 0.02 * noise(p.map(|x| x * 3.0), seed), p[2]];
-                let offset = [board as f32 * 7.3, 0.0, 0.0];
-                let at = [0, 1, 2].map(|k| fibre[k] + offset[k]);
-                (1.0 + tone + 0.22 * grain(at, 0.03, 4, footprint, seed)) * joint
-            }
->>>>>>> main
             Texture::Stripes { width, ratio } => {
                 let s = if flat == 2 { p[0] } else { p[2] };
                 let share = bands(s / (2.0 * width) + 0.25, footprint / (2.0 * width));

@@ -7,8 +7,8 @@ use vergence_devices::{JointReading, LedCommand, Side, TagAddress};
 use vergence_landmark::paper::PaperFinder;
 use vergence_landmark::sequential::SequentialFinder;
 use vergence_landmark::{Decision, Finder, FinderError, Request, Sighting};
-use vergence_tag::Pattern;
 use vergence_tag::pattern::Bits;
+use vergence_tag::{Pattern, codebook};
 
 use super::{Method, Run, Stop};
 use crate::event::Event;
@@ -26,11 +26,24 @@ impl Run<'_> {
     /// Chooses the pattern and has the tag play it.
     pub(super) fn start_blinking(&mut self, tag: TagAddress) -> Result<Pattern, Stop> {
         let interval = self.frame_interval()?;
-        let (bits, chip) = match self.config.method {
-            Method::Paper => (Bits::FLICKER, interval * FLICKER_FRAMES),
-            Method::Directional => ("110100100101".parse().unwrap_or(Bits::FLICKER), interval),
+        let rate = 1.0 / interval.as_secs_f64().max(1e-3);
+        let pattern = match self.config.method {
+            Method::Paper => Pattern::new(Bits::FLICKER, interval * FLICKER_FRAMES).ok(),
+            Method::Directional => codebook::assign(0, rate),
         };
-        let pattern = Pattern::new(bits, chip).map_err(|_| rate_fault(interval))?;
+        let pattern = pattern.ok_or_else(|| rate_fault(interval))?;
+        self.command(tag, LedCommand::Play(pattern))?;
+        Ok(pattern)
+    }
+
+    /// Has the tag play a pattern that nobody can know beforehand. The heads look for it when they
+    /// centre, so a lamp that happens to blink alike, another tag or a replay is lost there.
+    pub(super) fn challenge(&mut self, tag: TagAddress, played: Pattern) -> Result<Pattern, Stop> {
+        if self.config.method == Method::Paper {
+            return Ok(played);
+        }
+        let drawn = codebook::challenge(self.config.seed, played.chip, &[played.bits]);
+        let pattern = drawn.unwrap_or(played);
         self.command(tag, LedCommand::Play(pattern))?;
         Ok(pattern)
     }

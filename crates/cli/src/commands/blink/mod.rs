@@ -3,7 +3,7 @@
 //! In: a ROS 2 recording of one camera and a request (JSON: the patterns, the chip durations, the
 //! clock tolerance, the exposure). Out: JSON with one detection for every tag that is seen.
 
-mod recording;
+mod bound;
 mod report;
 mod request;
 
@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use vergence_landmark::{Finder, FinderError, paper, sequential};
+use vergence_ros::recording::{self, RecordingError};
 
 use self::report::Report;
 use self::request::BlinkRequest;
@@ -29,7 +30,7 @@ enum Method {
 #[derive(clap::Args)]
 pub struct Args {
     /// A ROS 2 recording (MCAP) with the images of one camera
-    #[arg(required_unless_present = "episodes", requires = "request")]
+    #[arg(required_unless_present_any = ["episodes", "bound"], requires = "request")]
     recording: Option<PathBuf>,
     /// What to look for (JSON)
     #[arg(long)]
@@ -37,6 +38,15 @@ pub struct Args {
     /// A folder of episodes, each a folder with recording.mcap and request.json; needs --out DIR
     #[arg(long, conflicts_with_all = ["recording", "request"], requires = "out")]
     episodes: Option<PathBuf>,
+    /// Simulate instead: frames to a decision against Wald's bound, and false alarms
+    #[arg(long, conflicts_with_all = ["recording", "request", "episodes"])]
+    bound: bool,
+    /// Runs for every signal-to-noise ratio of --bound
+    #[arg(long, default_value_t = 100, requires = "bound")]
+    runs: usize,
+    /// Minutes of tag-free video for --bound
+    #[arg(long, default_value_t = 5.0, requires = "bound")]
+    minutes: f64,
     /// How to look
     #[arg(long, value_enum, default_value = "sequential")]
     method: Method,
@@ -50,6 +60,15 @@ pub struct Args {
 
 /// Runs the command; `true` when every requested tag is decided.
 pub fn run(args: Args) -> Result<bool, Failure> {
+    if args.bound {
+        let bound = bound::run(args.runs, args.minutes)?;
+        if args.json {
+            println!("{}", serde_json::to_string_pretty(&bound).unwrap_or_default());
+        } else {
+            print!("{}", bound.text());
+        }
+        return Ok(true);
+    }
     if let (Some(set), Some(out)) = (&args.episodes, &args.out) {
         return run_set(set, out, args.method);
     }
@@ -115,9 +134,12 @@ fn look(recording: &Path, request: &Path, method: Method) -> Result<Report, Fail
     };
     let started = Instant::now();
     let (mut frames, mut first) = (0, None);
-    for frame in recording::frames(recording, &request.camera)? {
-        let mut frame = frame?;
-        frame.exposure = request.exposure();
+    let unreadable = |e: RecordingError| {
+        Failure::misuse(e, "name a ROS 2 recording (MCAP) and, as `camera`, its image topic")
+    };
+    let frames_of = recording::frames(recording, &request.camera, request.exposure());
+    for frame in frames_of.map_err(unreadable)? {
+        let mut frame = frame.map_err(unreadable)?;
         frame.row_time = request.row_time();
         first.get_or_insert(frame.stamp);
         finder.push(&frame).map_err(|e| refused(&e))?;
