@@ -77,10 +77,10 @@ fn what_is_missing_is_named() {
     let missing = refused(&world, &session, &settings);
     assert_eq!(missing, [Missing::Fixations { head: "right", have: 0, need: 24 }]);
 
-    // The light at two places only, always in the middle of the picture.
+    // The light at four places only, always in the middle of the picture.
     let (world, mut session, settings) = drawn(5, LightSource::Ruler);
-    session.places.truncate(2);
-    session.lengths.truncate(1);
+    session.places.truncate(4);
+    session.lengths.truncate(2);
     let near_centre = |p: &Point2<f64>| (p - Point2::new(159.5, 119.5)).norm() < 60.0;
     for place in &mut session.places {
         place.fixations.iter_mut().for_each(|f| f.retain(|f| near_centre(&f.pixel)));
