@@ -27,9 +27,6 @@ use search::{Search, Sight};
 use sites::Site;
 use verdict::Explained;
 
-/// Evidence adds up sites as if they were independent; that they share causes (one shadow, one line
-/// of print) makes its differences about this many times too large.
-const DEPENDENCE: f64 = 4.0;
 /// Alternatives reported.
 const MOST_ALTERNATIVES: usize = 4;
 
@@ -74,8 +71,8 @@ impl Default for Config {
             shortlist: 400,
             seeds: 32,
             climb_halvings: 3,
-            refined: 10,
-            finalists: 5,
+            refined: 16,
+            finalists: 10,
             grazing: 0.1,
             distinct: 2f64.to_radians(),
             different: 6f64.to_radians(),
@@ -188,7 +185,13 @@ impl Search<'_> {
         passes.push(Pass::new(EDGE_SD_PX, 4.0, 2.0, true));
         passes.push(Pass::new(EDGE_SD_PX, 4.0, 2.0, true));
         self.refine(&mut refined, &passes);
-        self.weigh(refined, &Pass::new(0.4, 4.0, 2.0, true))
+        // Print is fine, outlines are coarse: both scales have their say in what is explained.
+        let s = self.scale();
+        let (refined, coarse) = self.weigh(refined, &Pass::new(0.5 * s, 4.0 * s, 2.0 * s, false));
+        let (refined, mut fine) = self.weigh(refined, &Pass::new(0.4, 4.0, 2.0, true));
+        fine.evidence = 0.5 * (fine.evidence + coarse.evidence);
+        fine.coverage = fine.coverage.min(coarse.coverage);
+        (refined, fine)
     }
 
     /// What a refined pose explains, priors included.
@@ -248,7 +251,7 @@ impl Search<'_> {
         let Some(((best, explained), others)) = different.split_first() else {
             return Err(Refusal::NoAttitude);
         };
-        let odds = |e: &Explained| ((e.evidence - explained.evidence) / DEPENDENCE).exp();
+        let odds = |e: &Explained| (e.evidence - explained.evidence).exp();
         let twins = self.twins(&best.pose);
         let total = 1.0
             + others.iter().map(|o| odds(&o.1)).sum::<f64>()

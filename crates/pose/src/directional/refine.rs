@@ -24,8 +24,10 @@ use crate::model::Kind;
 /// Standard deviation of an edge's place once the pose is right (px): aliasing, gamma, blooming and
 /// bent edges, not only noise.
 pub const EDGE_SD_PX: f64 = 0.3;
-/// Neighbouring sites err alike: contour length (px) that counts as one independent measurement.
-pub const CORRELATION_PX: f64 = 4.0;
+/// Neighbouring sites err alike: contour length that counts as one independent measurement, in the
+/// picture (px; blur and aliasing) and on the object (m; bent edges, shadows, lines of print).
+const CORRELATION_PX: f64 = 5.0;
+const CORRELATION: f64 = 0.012;
 /// Density of edges that have nothing to do with the contour (per px of normal).
 pub const STRAY_DENSITY: f64 = 0.08;
 /// Deviation of a standing object's axis from gravity (rad): tables and heads are not quite level.
@@ -59,6 +61,11 @@ const SIZE_SD: f64 = 0.01;
 pub fn deviation(site: &Site, sd_px: f64) -> f64 {
     let form = if site.contact { CONTACT_SD } else { FORM_SD };
     sd_px.hypot(form * site.px_per_metre)
+}
+
+/// How many independent measurements a site is worth.
+pub fn independent(site: &Site) -> f64 {
+    (site.length / (CORRELATION_PX + CORRELATION * site.px_per_metre)).min(1.0)
 }
 
 /// One pass of the refinement.
@@ -379,7 +386,7 @@ fn assign(
         }
     }
     let total = sums[0].0 + sums[1].0 + missing * STRAY_DENSITY;
-    let scale = (site.length / CORRELATION_PX).min(1.0) / (sd * sd * total);
+    let scale = independent(site) / (sd * sd * total);
     [false, true]
         .into_iter()
         .zip(sums)

@@ -6,7 +6,7 @@
 //! measured along the very profiles, away from the contour: in print and clutter an edge in the
 //! right place proves little, on a plain table much.
 
-use super::refine::{CORRELATION_PX, absence, deviation};
+use super::refine::{absence, deviation, independent};
 use super::sites::Site;
 use crate::model::Kind;
 
@@ -51,7 +51,7 @@ pub fn weigh(sites: &[Site], range_px: f64, sd_px: f64) -> Explained {
             }
         }
         let ratio = missing + (1.0 - missing) * likelihood / density;
-        evidence += ratio.ln() * (site.length / CORRELATION_PX).min(1.0);
+        evidence += ratio.ln() * independent(site);
         let weight = site.length * if site.kind == Kind::Crease { 0.5 } else { 1.0 };
         length += weight;
         if nearest < BELONGS * sd_px {
