@@ -27,6 +27,9 @@ use search::{Search, Sight};
 use sites::Site;
 use verdict::Explained;
 
+/// Alternatives reported.
+const MOST_ALTERNATIVES: usize = 4;
+
 /// Settings of the directional method.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Config {
@@ -49,7 +52,9 @@ pub struct Config {
     pub finalists: usize,
     /// Cosine between the landmark's normal and the line of sight below which no camera sees it.
     pub grazing: f64,
-    /// Poses that differ by more than this turn (rad) count as different.
+    /// Roughly refined poses nearer than this (rad) are one: the finer refinement joins them.
+    pub distinct: f64,
+    /// Poses that differ by more than this turn (rad) count as different in the verdict.
     pub different: f64,
     /// Share of the contour that must lie on edges.
     pub least_coverage: f64,
@@ -66,12 +71,13 @@ impl Default for Config {
             shortlist: 400,
             seeds: 32,
             climb_halvings: 3,
-            refined: 10,
-            finalists: 4,
+            refined: 16,
+            finalists: 10,
             grazing: 0.1,
+            distinct: 2f64.to_radians(),
             different: 6f64.to_radians(),
             least_coverage: 0.5,
-            least_confidence: 0.6,
+            least_confidence: 0.9,
         }
     }
 }
@@ -107,10 +113,11 @@ pub fn recognise_traced<'a>(
     }
     let search = Search { sights: &sights, model: &model, query, landmark, normal, config };
     let hypotheses = search.hypotheses();
-    let rough = search.ranked(hypotheses.iter().map(|h| search.refine_roughly(&h.pose)).collect());
+    let rough = hypotheses.iter().map(|h| search.refine_roughly(&h.pose)).collect();
+    let rough = search.ranked(rough, config.distinct);
     let finalists = rough.iter().take(config.finalists);
-    let different =
-        search.ranked(finalists.map(|(rough, _)| search.refine_finely(rough.clone())).collect());
+    let fine = finalists.map(|(rough, _)| search.refine_finely(rough.clone())).collect();
+    let different = search.ranked(fine, config.different);
     let result = search.verdict(&different);
     let poses = different.iter().map(|(r, _)| r.pose).collect();
     let sites = different.into_iter().next().map(|(r, _)| r.sites).unwrap_or_default();
@@ -178,7 +185,13 @@ impl Search<'_> {
         passes.push(Pass::new(EDGE_SD_PX, 4.0, 2.0, true));
         passes.push(Pass::new(EDGE_SD_PX, 4.0, 2.0, true));
         self.refine(&mut refined, &passes);
-        self.weigh(refined, &Pass::new(0.4, 4.0, 2.0, true))
+        // Print is fine, outlines are coarse: both scales have their say in what is explained.
+        let s = self.scale();
+        let (refined, coarse) = self.weigh(refined, &Pass::new(0.5 * s, 4.0 * s, 2.0 * s, false));
+        let (refined, mut fine) = self.weigh(refined, &Pass::new(0.4, 4.0, 2.0, true));
+        fine.evidence = 0.5 * (fine.evidence + coarse.evidence);
+        fine.coverage = fine.coverage.min(coarse.coverage);
+        (refined, fine)
     }
 
     /// What a refined pose explains, priors included.
@@ -189,21 +202,48 @@ impl Search<'_> {
         (refined, explained)
     }
 
-    /// Best first, without those that do not differ from a better one.
-    fn ranked(&self, mut found: Vec<(Refined, Explained)>) -> Vec<(Refined, Explained)> {
+    /// Best first, without those less than `apart` (rad) from a better one.
+    fn ranked(
+        &self,
+        mut found: Vec<(Refined, Explained)>,
+        apart: f64,
+    ) -> Vec<(Refined, Explained)> {
         found.sort_by(|a, b| b.1.evidence.total_cmp(&a.1.evidence));
         let symmetry = self.query.symmetry();
         let mut kept: Vec<(Refined, Explained)> = Vec::new();
         for candidate in found {
             let turn = &candidate.0.pose.rotation;
-            let away = |k: &(Refined, Explained)| {
-                symmetry.angle_between(&k.0.pose.rotation, turn) > self.config.different
-            };
+            let away =
+                |k: &(Refined, Explained)| symmetry.angle_between(&k.0.pose.rotation, turn) > apart;
             if kept.iter().all(away) {
                 kept.push(candidate);
             }
         }
         kept
+    }
+
+    /// Poses whose contour is the same but for the tolerance of form, with their odds against this
+    /// one: only the landmark's place can tell them apart.
+    fn twins(&self, pose: &Transform) -> Vec<(Transform, f64)> {
+        let known = self.query.symmetry();
+        let weight = self.query.landmark.covariance.try_inverse().unwrap_or_default();
+        let misfit = |p: &Transform| {
+            let seen = p.rotation * self.landmark + p.translation.vector;
+            let residual = self.query.landmark.position.coords - seen;
+            (residual.transpose() * weight * residual).x
+        };
+        let stands = |p: &Transform| {
+            let up = self.query.up.map_or(0.0, |up| (p.rotation * Vector3::z()).dot(&up));
+            self.query.standing != Some(true) || up > 0.0
+        };
+        self.query
+            .near_symmetries()
+            .into_iter()
+            .map(|s| Transform::from_parts(pose.translation, pose.rotation * s))
+            .filter(|p| known.angle_between(&p.rotation, &pose.rotation) > self.config.different)
+            .filter(stands)
+            .map(|p| (p, (0.5 * (misfit(pose) - misfit(&p))).exp()))
+            .collect()
     }
 
     /// The best pose with its belief against the different ones, or a refusal.
@@ -212,16 +252,24 @@ impl Search<'_> {
             return Err(Refusal::NoAttitude);
         };
         let odds = |e: &Explained| (e.evidence - explained.evidence).exp();
-        let total = 1.0 + others.iter().map(|o| odds(&o.1)).sum::<f64>();
+        let twins = self.twins(&best.pose);
+        let total = 1.0
+            + others.iter().map(|o| odds(&o.1)).sum::<f64>()
+            + twins.iter().map(|(_, odds)| odds).sum::<f64>();
+        let others = others.iter().map(|o| (o.0.pose, odds(&o.1)));
+        let mut alternatives: Vec<Alternative> = twins
+            .iter()
+            .copied()
+            .chain(others)
+            .map(|(pose, odds)| Alternative { pose, confidence: odds / total })
+            .collect();
+        alternatives.sort_by(|a, b| b.confidence.total_cmp(&a.confidence));
+        alternatives.truncate(MOST_ALTERNATIVES);
         let found = ObjectPose {
             pose: GaussianPose { pose: best.pose, covariance: best.covariance },
             confidence: 1.0 / total,
             coverage: explained.coverage,
-            alternatives: others
-                .iter()
-                .map(|o| Alternative { pose: o.0.pose, confidence: odds(&o.1) / total })
-                .take(4)
-                .collect(),
+            alternatives,
             symmetry: self.query.symmetry(),
         };
         if found.coverage < self.config.least_coverage {
