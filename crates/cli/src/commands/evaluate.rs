@@ -40,6 +40,9 @@ struct Head {
     /// Re-aims over which one measurement averages.
     #[arg(long, default_value_t = EvaluationConfig::default().aims)]
     aims: usize,
+    /// Places of the light for the calibration.
+    #[arg(long, default_value_t = EvaluationConfig::default().places)]
+    places: usize,
     /// How the light of the calibration is moved.
     #[arg(long, value_enum, default_value_t = Light::Ruler)]
     light: Light,
@@ -103,9 +106,12 @@ fn run_equation(json: bool) {
 }
 
 fn run_head(args: &Head) -> Result<bool, Failure> {
-    for (name, value) in
-        [("placements", args.placements), ("heads", args.heads), ("aims", args.aims)]
-    {
+    for (name, value) in [
+        ("placements", args.placements),
+        ("heads", args.heads),
+        ("aims", args.aims),
+        ("places", args.places),
+    ] {
         if value == 0 || value > 100_000 {
             return Err(Failure::misuse(
                 format!("--{name} {value} is not between 1 and 100000"),
@@ -117,6 +123,7 @@ fn run_head(args: &Head) -> Result<bool, Failure> {
         placements: args.placements,
         heads: args.heads,
         aims: args.aims,
+        places: args.places,
         light: match args.light {
             Light::Ruler => LightSource::Ruler,
             Light::Arm => LightSource::Arm,

@@ -164,7 +164,9 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    fn bodies(stream: &[u8]) -> (Vec<(Vec<u8>, Option<f64>)>, StreamError) {
+    type Picture = (Vec<u8>, Option<f64>);
+
+    fn bodies(stream: &[u8]) -> (Vec<Picture>, StreamError) {
         let mut out = Vec::new();
         let mut parts = match Parts::open(stream) {
             Ok(parts) => parts,

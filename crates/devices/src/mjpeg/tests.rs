@@ -22,8 +22,10 @@ fn part(value: u8, stamp: f64) -> Vec<u8> {
     [head.as_bytes(), &body, b"\r\n"].concat()
 }
 
+type Script = Box<dyn Fn(&mut TcpStream) + Send>;
+
 /// Serves each connection by the next of `scripts`.
-fn server(scripts: Vec<Box<dyn Fn(&mut TcpStream) + Send>>) -> String {
+fn server(scripts: Vec<Script>) -> String {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let url = format!("http://{}/stream", listener.local_addr().unwrap());
     std::thread::spawn(move || {

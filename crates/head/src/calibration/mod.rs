@@ -289,7 +289,7 @@ pub fn calibrate(
         covariance: solution.covariance,
     };
     let distance_sigma = diagnosis::worst_distance_sigma(&calibration);
-    if !(distance_sigma <= config.required_distance_sigma) {
+    if distance_sigma.is_nan() || distance_sigma > config.required_distance_sigma {
         let missing = diagnosis::missing_after(&calibration, places, lengths);
         return Err(CalibrateError::Unconstrained { missing, distance_sigma });
     }
