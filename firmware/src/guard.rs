@@ -11,12 +11,12 @@
 
 use core::cell::{Cell, RefCell};
 
+use bt_hci::ControllerToHostPacket;
 use bt_hci::cmd::{AsyncCmd, Error as CommandError, SyncCmd};
 use bt_hci::controller::{Controller, ControllerCmdAsync, ControllerCmdSync};
 use bt_hci::data::{AclBroadcastFlag, AclPacket, AclPacketBoundary, IsoPacket, SyncPacket};
 use bt_hci::event::{EventKind, EventPacket};
 use bt_hci::param::ConnHandle;
-use bt_hci::ControllerToHostPacket;
 use embedded_io::ErrorType;
 
 use crate::frame::well_formed;

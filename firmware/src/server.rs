@@ -3,12 +3,12 @@
 //! The tag service comes first in the table, so that one request of a robot finds all of it.
 
 use embassy_sync::blocking_mutex::raw::NoopRawMutex;
+use trouble_host::PacketPool;
 use trouble_host::attribute::{
     AttributeTable, Characteristic, CharacteristicProp, PermissionLevel, Service, Uuid,
 };
-use trouble_host::prelude::{AttributeServer, GapConfig, GattConnection, PeripheralConfig};
 use trouble_host::prelude::appearance;
-use trouble_host::PacketPool;
+use trouble_host::prelude::{AttributeServer, GapConfig, GattConnection, PeripheralConfig};
 use vergence_tag::State;
 use vergence_tag::command::MAX_COMMAND_BYTES;
 use vergence_tag::gatt::{self, LONGEST_VALUE};
@@ -29,14 +29,9 @@ pub struct Values {
     upload: [u8; UPLOAD_BYTES],
 }
 
-impl Values {
-    /// Empty values.
-    pub const fn new() -> Self {
-        Values {
-            record: [0; LONGEST_VALUE],
-            rest: [0; LONGEST_VALUE],
-            upload: [0; UPLOAD_BYTES],
-        }
+impl Default for Values {
+    fn default() -> Self {
+        Values { record: [0; LONGEST_VALUE], rest: [0; LONGEST_VALUE], upload: [0; UPLOAD_BYTES] }
     }
 }
 
@@ -97,11 +92,7 @@ impl<'v, P: PacketPool> Server<'v, P> {
             .write_permission(commands)
             .build();
         let state = tag
-            .add_characteristic_small(
-                uuid(gatt::STATE),
-                [Read, Notify],
-                State::default().encode(),
-            )
+            .add_characteristic_small(uuid(gatt::STATE), [Read, Notify], State::default().encode())
             .build();
         tag.build();
 
@@ -132,7 +123,8 @@ impl<'v, P: PacketPool> Server<'v, P> {
     pub fn set_record(&self, record: &[u8]) {
         let split = record.len().min(LONGEST_VALUE);
         let table = self.attributes.table();
-        for (characteristic, part) in [(&self.record, &record[..split]), (&self.rest, &record[split..])]
+        for (characteristic, part) in
+            [(&self.record, &record[..split]), (&self.rest, &record[split..])]
         {
             // Records have 1024 bytes at most: both halves fit.
             if let Ok(value) = Value::from_slice(part) {

@@ -225,8 +225,9 @@ impl Medium {
                 Some(peer) => peer == from,
                 None => candidate.accept_list.contains(&from),
             });
-            let both_ways =
-                || self.rssi(advertiser, *other).is_some() && self.rssi(*other, advertiser).is_some();
+            let both_ways = || {
+                self.rssi(advertiser, *other).is_some() && self.rssi(*other, advertiser).is_some()
+            };
             *other != advertiser && wanted && both_ways()
         };
         let initiators: Vec<usize> = (0..self.devices.len()).filter(answers).collect();

@@ -237,17 +237,12 @@ impl Medium {
         let [low, high] = handle.unwrap_or(0).to_le_bytes();
         let missing = if known.is_some() { status::SUCCESS } else { status::UNKNOWN_CONNECTION };
         let state = match (opcode, handle) {
-            (op::LE_CREATE_CONNECTION, _) => {
-                p.first_chunk().map_or(status::INVALID_PARAMETERS, |p| {
-                    self.create_connection(device, p)
-                })
-            }
-            (op::DISCONNECT, Some(handle)) if p.len() == 3 => {
-                self.disconnect(device, handle, p[2])
-            }
+            (op::LE_CREATE_CONNECTION, _) => p
+                .first_chunk()
+                .map_or(status::INVALID_PARAMETERS, |p| self.create_connection(device, p)),
+            (op::DISCONNECT, Some(handle)) if p.len() == 3 => self.disconnect(device, handle, p[2]),
             (op::LE_CONNECTION_UPDATE, Some(handle)) if p.len() == 14 => {
-                let timing =
-                    LinkTiming { interval: word(4), latency: word(6), timeout: word(8) };
+                let timing = LinkTiming { interval: word(4), latency: word(6), timeout: word(8) };
                 self.request_update(device, handle, timing)
             }
             (op::LE_ENABLE_ENCRYPTION, Some(handle)) if p.len() == 28 => {
@@ -299,7 +294,9 @@ impl Medium {
         let bad = status::INVALID_PARAMETERS;
         let on = p.first() == Some(&1);
         let state = match opcode {
-            op::LE_SET_ADV_PARAMS => p.first_chunk().map_or(bad, |p| self.set_advertising(device, p)),
+            op::LE_SET_ADV_PARAMS => {
+                p.first_chunk().map_or(bad, |p| self.set_advertising(device, p))
+            }
             op::LE_SET_ADV_DATA => self.set_advertising_data(device, p, false),
             op::LE_SET_SCAN_RESPONSE => self.set_advertising_data(device, p, true),
             op::LE_SET_ADV_ENABLE => self.enable_advertising(device, on),
@@ -348,10 +345,9 @@ impl Medium {
 
 impl Device {
     fn edit_accept_list(&mut self, opcode: u16, p: &[u8]) -> u8 {
-        let entry = p.first_chunk::<7>().map(|[kind, bytes @ ..]| Address {
-            kind: kind & 1,
-            bytes: *bytes,
-        });
+        let entry = p
+            .first_chunk::<7>()
+            .map(|[kind, bytes @ ..]| Address { kind: kind & 1, bytes: *bytes });
         match (opcode, entry) {
             (op::LE_CLEAR_ACCEPT_LIST, _) => self.accept_list.clear(),
             (_, None) => return status::INVALID_PARAMETERS,

@@ -66,10 +66,7 @@ impl Default for Executor {
         Executor {
             tasks: RefCell::default(),
             next: RefCell::new(0),
-            ready: Arc::new(Ready {
-                queue: Mutex::default(),
-                thread: std::thread::current(),
-            }),
+            ready: Arc::new(Ready { queue: Mutex::default(), thread: std::thread::current() }),
         }
     }
 }
@@ -158,11 +155,7 @@ impl Executor {
     fn waker(&self) -> Arc<TaskWaker> {
         let mut next = self.next.borrow_mut();
         *next += 1;
-        Arc::new(TaskWaker {
-            id: *next,
-            queued: AtomicBool::new(false),
-            ready: self.ready.clone(),
-        })
+        Arc::new(TaskWaker { id: *next, queued: AtomicBool::new(false), ready: self.ready.clone() })
     }
 
     fn run_ready(&self) {
@@ -177,8 +170,7 @@ impl Executor {
             }
             let Some((mut task, waker)) = self.take(id) else { continue };
             waker.queued.store(false, Ordering::Release);
-            let done =
-                task.as_mut().poll(&mut Context::from_waker(&Waker::from(waker))).is_ready();
+            let done = task.as_mut().poll(&mut Context::from_waker(&Waker::from(waker))).is_ready();
             let mut tasks = self.tasks.borrow_mut();
             if done {
                 tasks.remove(&id);

@@ -88,12 +88,7 @@ impl Link {
 
 impl Medium {
     /// Links a central with a peripheral; both hosts are told.
-    pub fn connect(
-        &mut self,
-        devices: [usize; 2],
-        addresses: [Address; 2],
-        timing: LinkTiming,
-    ) {
+    pub fn connect(&mut self, devices: [usize; 2], addresses: [Address; 2], timing: LinkTiming) {
         let id = self.new_link_id();
         let [central, peripheral] = devices;
         let ends = devices.map(|device| End {
@@ -103,9 +98,8 @@ impl Medium {
             hold: 0,
         });
         let now = now_micros();
-        for (side, (device, peer)) in [(central, addresses[1]), (peripheral, addresses[0])]
-            .into_iter()
-            .enumerate()
+        for (side, (device, peer)) in
+            [(central, addresses[1]), (peripheral, addresses[0])].into_iter().enumerate()
         {
             let event = hci::connected(ends[side].handle, side == 1, peer, timing);
             self.devices[device].send(event);
@@ -145,10 +139,11 @@ impl Medium {
     fn plan_exchange(&mut self, id: u32) {
         let timed = self.config.connection_events;
         let Some(link) = self.links.get_mut(&id) else { return };
-        let waiting =
-            link.ends.iter().filter_map(|end| Some((end.queue.front()?, end.hold))).min_by_key(
-                |(_, hold)| *hold,
-            );
+        let waiting = link
+            .ends
+            .iter()
+            .filter_map(|end| Some((end.queue.front()?, end.hold)))
+            .min_by_key(|(_, hold)| *hold);
         let Some((packet, hold)) = waiting else { return };
         if link.exchange_planned {
             return;

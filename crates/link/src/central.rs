@@ -33,7 +33,7 @@ use vergence_tag::gatt::{self, LONGEST_VALUE};
 use vergence_tag::{Command, State, Upload};
 
 use crate::ears::Ears;
-use crate::job::{Answer, Bond, Fault, Inbox, Job, Outcome, Task, TagInfo};
+use crate::job::{Answer, Bond, Fault, Inbox, Job, Outcome, TagInfo, Task};
 use crate::pool::HeapPool;
 
 /// Links at once: the tag that is being asked, and those that blink.
@@ -397,11 +397,11 @@ impl<'a, C: Controller + ControllerCmdSync<LeSetScanParams>> Central<'a, '_, C> 
         tag: TagAddress,
     ) -> Outcome {
         let mut texts = [const { String::new() }; 3];
-        for (text, kind) in
-            texts.iter_mut().zip([gatt::MANUFACTURER, gatt::MODEL, gatt::FIRMWARE])
+        for (text, kind) in texts.iter_mut().zip([gatt::MANUFACTURER, gatt::MODEL, gatt::FIRMWARE])
         {
             let value = self.find(client, &Uuid::new_short(kind)).await?;
-            *text = value.map(|(_, v)| String::from_utf8_lossy(&v).into_owned()).unwrap_or_default();
+            *text =
+                value.map(|(_, v)| String::from_utf8_lossy(&v).into_owned()).unwrap_or_default();
         }
         let [manufacturer, model, firmware] = texts;
         let handles = self.handles(client, tag).await?;
@@ -496,7 +496,9 @@ impl<'a, C: Controller + ControllerCmdSync<LeSetScanParams>> Central<'a, '_, C> 
                     connection.pass_key_input(passkey.unwrap_or(0)).map_err(|_| Fault::Lost)?;
                 }
                 ConnectionEvent::PairingComplete { bond, .. } => {
-                    return Ok(Answer::Paired(bond.map(|b: BondInformation| Bond(encode_bond(&b)))));
+                    return Ok(Answer::Paired(
+                        bond.map(|b: BondInformation| Bond(encode_bond(&b))),
+                    ));
                 }
                 ConnectionEvent::PairingFailed(reason) => {
                     return Err(Fault::Refused(format!("pairing failed: {reason:?}")));

@@ -1,8 +1,8 @@
 //! The robot's tag radio: a plain object on top, the Bluetooth host on a thread of its own below.
 
 use std::io;
-use std::sync::mpsc::{self, RecvTimeoutError, Sender};
 use std::sync::Arc;
+use std::sync::mpsc::{self, RecvTimeoutError, Sender};
 use std::time::Duration;
 
 use bt_hci::controller::ExternalController;
@@ -15,7 +15,7 @@ use vergence_tag::Command;
 use vergence_tag::cbor::{self, MAX_BYTES};
 
 use crate::central::{self, LinkConfig};
-use crate::job::{Answer, Bond, Fault, Inbox, Job, Outcome, Task, TagInfo};
+use crate::job::{Answer, Bond, Fault, Inbox, Job, Outcome, TagInfo, Task};
 
 /// HCI commands under way at once.
 const COMMANDS: usize = 10;
@@ -91,11 +91,7 @@ impl HciLink {
             };
             let _ = opened.send(Ok(()));
             // On real time something can always still come: the executor never stalls.
-            let _ = Executor::new().block_on(central::run(
-                Hci::new(transport),
-                config,
-                jobs,
-            ));
+            let _ = Executor::new().block_on(central::run(Hci::new(transport), config, jobs));
         })?;
         outcome.recv().map_err(|_| io::Error::other("the radio thread died"))??;
         Ok(HciLink { drive: Drive::RealTime(inbox) })

@@ -107,9 +107,7 @@ impl Fault {
     pub fn device_error(self, device: String, timeout: Duration) -> DeviceError {
         match self {
             Fault::Late => DeviceError::Timeout { device, timeout },
-            Fault::Lost => {
-                DeviceError::Disconnected { device, reason: "the link broke".into() }
-            }
+            Fault::Lost => DeviceError::Disconnected { device, reason: "the link broke".into() },
             Fault::Refused(fault) => DeviceError::Fault { device, fault },
             Fault::Dead(reason) => DeviceError::Disconnected { device, reason },
         }

@@ -52,10 +52,10 @@ impl<'a> Upload<'a> {
         record: &'a [u8],
     ) -> impl Iterator<Item = heapless::Vec<u8, { PIECE + 2 }>> + 'a {
         let record = if record.len() <= MAX_BYTES { record } else { &[] };
-        let pieces = record.chunks(PIECE).enumerate().map(|(k, data)| Upload::Piece {
-            offset: (k * PIECE) as u16,
-            data,
-        });
+        let pieces = record
+            .chunks(PIECE)
+            .enumerate()
+            .map(|(k, data)| Upload::Piece { offset: (k * PIECE) as u16, data });
         let commit = Upload::Commit { length: record.len() as u16, crc: crc32(record) };
         pieces.chain((!record.is_empty()).then_some(commit)).map(|message| message.encode())
     }
