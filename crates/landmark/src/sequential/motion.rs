@@ -16,6 +16,9 @@ const LANES: usize = 8;
 /// unknown, then narrow.
 const CUTS: [f32; 4] = [40.0, 20.0, 10.0, 10.0];
 
+/// Slopes must carry this many times the energy that noise gives them.
+const STRUCTURE: f64 = 3.0;
+
 /// Largest shift that is followed (px of the half-size picture): sway, not a moving head.
 const MOST_PX: f64 = 8.0;
 
@@ -73,25 +76,35 @@ fn fit(reference: &Image<f32>, half: &Image<f32>, guess: (f64, f64)) -> Placemen
     let row_gain: Vec<f32> =
         (0..h).map(|y| brightness(reference.row(y), half.row(y), &mut ratios)).collect();
     let (mut dx, mut dy) = (0.5 * guess.0, 0.5 * guess.1);
+    let (mut error, mut structure) = ([0.0; 2], 0.0);
     for cut in CUTS {
         // The content moved by d: the frame shows at x what the reference shows at x - d.
         let moved = shifted(reference, -dx, -dy);
-        let mut normal = [0.0f64; 5];
+        let mut normal = [0.0f64; 7];
         for y in 1..h - 1 {
             let rows = [moved.row(y - 1), moved.row(y), moved.row(y + 1)];
             reduce(&accumulate(rows, half.row(y), row_gain[y], cut), &mut normal);
         }
-        let [xx, xy, yy, xr, yr] = normal;
+        let [xx, xy, yy, xr, yr, rr, weight] = normal;
         let determinant = xx * yy - xy * xy;
-        // A picture without structure in some direction says nothing about motion along it.
         if determinant <= 1e-3 * xx * yy || xx <= 1.0 || yy <= 1.0 {
-            continue;
+            return Placement { row_gain, ..Placement::default() };
         }
+        let noise = rr / weight.max(1.0);
+        structure = xx.min(yy) / (noise * weight).max(1.0);
+        error = [(noise / xx).sqrt(), (noise / yy).sqrt()];
         let step = ((yy * xr - xy * yr) / determinant, (xx * yr - xy * xr) / determinant);
         dx = (dx - step.0.clamp(-1.5, 1.5)).clamp(-MOST_PX, MOST_PX);
         dy = (dy - step.1.clamp(-1.5, 1.5)).clamp(-MOST_PX, MOST_PX);
     }
-    Placement { dx: 2.0 * dx, dy: 2.0 * dy, row_gain }
+    // Noise alone gives slopes of half its variance. Where the slopes are little more than that in
+    // some direction, the picture has no structure that could tell of motion along it.
+    if structure < 0.5 * STRUCTURE {
+        return Placement { row_gain, ..Placement::default() };
+    }
+    // A shift within its own uncertainty is none: moving a still picture only blurs it.
+    let real = |d: f64, e: f64| if d.abs() > 2.5 * e { 2.0 * d } else { 0.0 };
+    Placement { dx: real(dx, error[0]), dy: real(dy, error[1]), row_gain }
 }
 
 /// Brightness of a row relative to the reference: median of the ratios of its brighter pixels.
@@ -107,13 +120,13 @@ fn brightness(reference: &[f32], row: &[f32], ratios: &mut Vec<f32>) -> f32 {
     *ratios.select_nth_unstable_by(middle, f32::total_cmp).1
 }
 
-/// Weighted sums over one row: weight; slope x, slope y, residual; products xx, xy, yy, xr, yr.
+/// Weighted sums over one row: weight; slope x, slope y, residual; products xx, xy, yy, xr, yr, rr.
 #[multiversion::multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
-fn accumulate([above, here, below]: [&[f32]; 3], frame: &[f32], gain: f32, cut: f32) -> [f32; 9] {
+fn accumulate([above, here, below]: [&[f32]; 3], frame: &[f32], gain: f32, cut: f32) -> [f32; 10] {
     let n = here.len();
     let (above, below, frame) = (&above[..n], &below[..n], &frame[..n]);
     let scale = 1.0 / (cut * cut);
-    let mut lanes = [[0.0f32; LANES]; 9];
+    let mut lanes = [[0.0f32; LANES]; 10];
     let mut x = 1;
     while x + LANES < n {
         let (left, right) = (&here[x - 1..x - 1 + LANES], &here[x + 1..x + 1 + LANES]);
@@ -134,20 +147,22 @@ fn accumulate([above, here, below]: [&[f32]; 3], frame: &[f32], gain: f32, cut: 
             lanes[6][k] += wy * gy;
             lanes[7][k] += wx * r;
             lanes[8][k] += wy * r;
+            lanes[9][k] += weight * r * r;
         }
         x += LANES;
     }
     lanes.map(|lane| lane.iter().sum())
 }
 
-/// Adds a row to the normal equations (xx, xy, yy, xr, yr), its own offset eliminated.
-fn reduce(sums: &[f32; 9], normal: &mut [f64; 5]) {
-    let [weight, x, y, r, xx, xy, yy, xr, yr] = sums.map(f64::from);
+/// Adds a row to the normal equations (xx, xy, yy, xr, yr, rr, weight), its own offset
+/// eliminated.
+fn reduce(sums: &[f32; 10], normal: &mut [f64; 7]) {
+    let [weight, x, y, r, xx, xy, yy, xr, yr, rr] = sums.map(f64::from);
     if weight < 8.0 {
         return;
     }
     let centred = [xx - x * x / weight, xy - x * y / weight, yy - y * y / weight];
-    let right = [xr - x * r / weight, yr - y * r / weight];
+    let right = [xr - x * r / weight, yr - y * r / weight, rr - r * r / weight, weight];
     for (n, c) in normal.iter_mut().zip(centred.into_iter().chain(right)) {
         *n += c;
     }
