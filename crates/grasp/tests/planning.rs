@@ -8,7 +8,7 @@ use std::path::Path;
 use nalgebra::{Matrix6, Translation3, UnitQuaternion, Vector3, Vector6};
 use vergence_devices::Description;
 use vergence_geometry::{Body, GaussianPose, JointAngles, Solid, Trajectory, Transform};
-use vergence_grasp::{Config, Hold, Obstacle, Plan, Refusal, Request, Robot, plan};
+use vergence_grasp::{Config, Hold, Obstacle, Plan, Refusal, Request, Robot, correct, plan};
 use vergence_tag::Record;
 
 const HOME: JointAngles = [-0.9, -0.6, 1.3, 0.0, 0.9, 0.0];
@@ -228,4 +228,32 @@ fn plans_repeat_bit_for_bit() {
     let obstacles = [table(), lamp];
     let first = ask(&record, &object, &obstacles).unwrap();
     assert_eq!(ask(&record, &object, &obstacles).unwrap(), first);
+}
+
+#[test]
+fn a_second_look_corrects_the_rest_of_the_plan_or_voids_it() {
+    let (record, robot, config) = (carton(), robot(), Config::default());
+    let first = standing(&record, 0.6, 0.1, 0.7, 3.0);
+    let made = ask(&record, &first, &[table()]).unwrap();
+    let pregrasp = made.pregrasp().unwrap();
+    let look = |x: f64| {
+        let object = standing(&record, x, 0.1, 0.72, 1.0);
+        let request = Request {
+            record: &record,
+            object: &object,
+            landmark: 0,
+            start: &pregrasp,
+            obstacles: &[table()],
+            free_azimuths: &[],
+            seed: 1,
+        };
+        let wanted = object.pose * made.grasp.object_from_tip;
+        (correct(&robot, &made, &request, &config), wanted)
+    };
+    let (corrected, wanted) = look(0.605);
+    let corrected = corrected.unwrap();
+    assert_eq!(corrected.transfer.waypoints[0].positions, pregrasp);
+    let closed = robot.arm.forward(&end(&corrected.approach)).translation.vector;
+    assert!((closed - wanted.translation.vector).norm() < 1e-6);
+    assert!(matches!(look(0.66).0, Err(Refusal::Moved { .. })));
 }
