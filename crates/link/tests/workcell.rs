@@ -1,4 +1,5 @@
 //! Robot and tags over the virtual air: what a robot does with tags, on virtual time.
+#![allow(clippy::unwrap_used)] // Outside of #[test] functions too: a test that cannot go on fails.
 
 mod support;
 
