@@ -254,6 +254,8 @@ impl<P: PacketPool, F: NorFlash, L: Lights, B: Battery, W: Watchdog> Tag<'_, '_,
         let led_count = lights.count();
         let state = || State { playing: remote.playing(), has_record: has_record.get(), battery };
         let mut session = Session { server, remote, store, record, led_count, new_record: None };
+        // What a subscribed robot was told last; only changes are worth a notification.
+        let told = Cell::new(state());
         let requests = async {
             let mut last = Instant::now();
             loop {
@@ -291,8 +293,11 @@ impl<P: PacketPool, F: NorFlash, L: Lights, B: Battery, W: Watchdog> Tag<'_, '_,
                         if let Some(id) = &session.new_record {
                             has_record.set(!id.is_empty());
                         }
-                        server.set_state(state());
-                        server.notify(connection, state()).await;
+                        let now = state();
+                        server.set_state(now);
+                        if told.replace(now) != now {
+                            server.notify(connection, now).await;
+                        }
                     }
                     _ => {}
                 }
@@ -301,8 +306,10 @@ impl<P: PacketPool, F: NorFlash, L: Lights, B: Battery, W: Watchdog> Tag<'_, '_,
         let ends = async {
             loop {
                 remote.ended().await;
-                server.set_state(state());
-                server.notify(connection, state()).await;
+                let now = state();
+                told.set(now);
+                server.set_state(now);
+                server.notify(connection, now).await;
             }
         };
         let playing = led::play(*lights, remote, config.longest_play);

@@ -1,4 +1,5 @@
 //! What a tag keeps survives a power cut at every single step of writing it.
+#![allow(clippy::unwrap_used)] // Outside of #[test] functions too: a test that cannot go on fails.
 
 use std::cell::RefCell;
 use std::rc::Rc;

@@ -379,13 +379,14 @@ impl<'a, C: Controller + ControllerCmdSync<LeSetScanParams>> Central<'a, '_, C> 
             return Err(Fault::Refused("holds no record".into()));
         }
         record.truncate(MAX_BYTES);
-        if let (Some(claimed), Ok(record)) = (self.ears.object_id(tag), cbor::decode(&record)) {
-            if !claimed.matches(&record.object_id) {
-                return Err(Fault::Refused(format!(
-                    "advertises \"{}\" but holds the record of \"{}\"",
-                    claimed.name, record.object_id
-                )));
-            }
+        let claimed = self.ears.object_id(tag);
+        if let (Some(claimed), Ok(record)) = (claimed, cbor::decode(&record))
+            && !claimed.matches(&record.object_id)
+        {
+            return Err(Fault::Refused(format!(
+                "advertises \"{}\" but holds the record of \"{}\"",
+                claimed.name, record.object_id
+            )));
         }
         Ok(Answer::Record(record))
     }

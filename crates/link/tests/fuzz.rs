@@ -1,5 +1,6 @@
 //! Sessions over a link that mangles what it carries: one fragment in six, both ways. Every call ends
 //! in time, nobody panics, and a tag that is left alone again serves its record.
+#![allow(clippy::unwrap_used)] // Outside of #[test] functions too: a test that cannot go on fails.
 
 mod support;
 

@@ -1,4 +1,5 @@
 //! Hostile robots against the real firmware: whatever they send, the tag serves the next robot.
+#![allow(clippy::unwrap_used)] // Outside of #[test] functions too: a test that cannot go on fails.
 
 mod support;
 

@@ -1,4 +1,5 @@
 //! The radio on real time over TCP: a robot and tags as two programs would be.
+#![allow(clippy::unwrap_used)] // Outside of #[test] functions too: a test that cannot go on fails.
 
 mod support;
 
