@@ -15,7 +15,7 @@ pub mod search;
 pub mod sites;
 pub mod verdict;
 
-use nalgebra::Vector3;
+use nalgebra::{Matrix6, Vector3};
 use vergence_geometry::{GaussianPose, Transform};
 
 use crate::model::Model;
@@ -26,6 +26,20 @@ use refine::{EDGE_SD_PX, Pass, Refined};
 use search::{Search, Sight};
 use sites::Site;
 use verdict::Explained;
+
+/// The information counts what is modelled; measured errors have about this much more variance.
+const INFLATION: f64 = 2.5;
+/// No rotation is known better than this (rad): edges of real objects are not that straight.
+const ROTATION_FLOOR: f64 = 0.003;
+
+/// Covariance with what the model leaves out, so that the truth lies inside as often as it says.
+fn honest(covariance: &Matrix6<f64>) -> Matrix6<f64> {
+    let mut out = covariance * INFLATION;
+    for k in 0..3 {
+        out[(k, k)] += ROTATION_FLOOR * ROTATION_FLOOR;
+    }
+    out
+}
 
 /// Alternatives reported.
 const MOST_ALTERNATIVES: usize = 4;
@@ -60,6 +74,8 @@ pub struct Config {
     pub least_coverage: f64,
     /// Belief in the best pose below which it is refused.
     pub least_confidence: f64,
+    /// Turn (rad) between two pictures beyond which a tracked object counts as lost.
+    pub most_turn: f64,
 }
 
 impl Default for Config {
@@ -78,6 +94,7 @@ impl Default for Config {
             different: 6f64.to_radians(),
             least_coverage: 0.5,
             least_confidence: 0.9,
+            most_turn: 15f64.to_radians(),
         }
     }
 }
@@ -107,7 +124,7 @@ pub fn recognise_traced<'a>(
 ) -> Result<(Result<ObjectPose, Refusal>, Trace<'a>), Refusal> {
     let (landmark, normal) = check(views, query)?;
     let model = Model::new(query.record);
-    let sights = prepare(views, query, landmark, config);
+    let sights = prepare(views, query, landmark, config, true);
     if sights.is_empty() {
         return Err(Refusal::OutOfView);
     }
@@ -124,12 +141,38 @@ pub fn recognise_traced<'a>(
     Ok((result, Trace { sights, model, poses, sites }))
 }
 
-/// Gradients, edges and fields of the views that can show the object.
+/// Follows an object from picture to picture: the pose near the `last` one, without a search, or
+/// that it was lost. The landmark need not blink meanwhile, but its place must be kept up to date
+/// (the last pose gives it), with a covariance that says how far the object may have moved.
+pub fn track(
+    views: &[View],
+    query: &Query,
+    last: &Transform,
+    config: &Config,
+) -> Result<ObjectPose, Refusal> {
+    let (landmark, normal) = check(views, query)?;
+    let model = Model::new(query.record);
+    let sights = prepare(views, query, landmark, config, false);
+    if sights.is_empty() {
+        return Err(Refusal::OutOfView);
+    }
+    let search = Search { sights: &sights, model: &model, query, landmark, normal, config };
+    let (rough, _) = search.refine_roughly(last);
+    let found = search.verdict(&[search.refine_finely(rough)])?;
+    let turned = query.symmetry().angle_between(&found.pose.pose.rotation, &last.rotation);
+    if turned > config.most_turn {
+        return Err(Refusal::Lost { turned_deg: turned.to_degrees(), best: Box::new(found) });
+    }
+    Ok(found)
+}
+
+/// Gradients of the views that can show the object; edges and fields when there is to be a search.
 fn prepare<'a>(
     views: &[View<'a>],
     query: &Query,
     landmark: Vector3<f64>,
     config: &Config,
+    search: bool,
 ) -> Vec<Sight<'a>> {
     let half = Vector3::from(query.record.bounding_box.sides()) / 2.0;
     // The corner furthest from the landmark bounds what the object can reach.
@@ -150,7 +193,9 @@ fn prepare<'a>(
             let region = Region::around((pixel.x, pixel.y), reach_px, width, height)?;
             let coarse = Level::new(view.image, &region, scale);
             let fine = (scale > 1).then(|| Level::new(view.image, &region, 1));
-            let field = Field::new(&edges::edgels(&coarse), coarse.width(), coarse.height());
+            let field = search
+                .then(|| Field::new(&edges::edgels(&coarse), coarse.width(), coarse.height()))
+                .unwrap_or_default();
             let straight = view.camera.distortion.is_none();
             Some(Sight { view: *view, optical_from_base, straight, coarse, fine, field })
         })
@@ -266,7 +311,7 @@ impl Search<'_> {
         alternatives.sort_by(|a, b| b.confidence.total_cmp(&a.confidence));
         alternatives.truncate(MOST_ALTERNATIVES);
         let found = ObjectPose {
-            pose: GaussianPose { pose: best.pose, covariance: best.covariance },
+            pose: GaussianPose { pose: best.pose, covariance: honest(&best.covariance) },
             confidence: 1.0 / total,
             coverage: explained.coverage,
             alternatives,

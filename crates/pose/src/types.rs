@@ -167,6 +167,14 @@ pub enum Refusal {
         /// The best guess, not to be relied on.
         best: Box<ObjectPose>,
     },
+    /// Tracking found something, but turned further than an object does between two pictures.
+    #[error("lost: the best pose is turned by {turned_deg:.0} degrees since the last picture")]
+    Lost {
+        /// By how much (degrees).
+        turned_deg: f64,
+        /// What was found, not to be relied on.
+        best: Box<ObjectPose>,
+    },
     /// Another pose explains the edges about as well.
     #[error("two different poses explain the edges about as well (confidence {:.2})", .best.confidence)]
     Ambiguous {
@@ -179,7 +187,9 @@ impl Refusal {
     /// The best guess behind a refusal, when there was one.
     pub fn best_guess(&self) -> Option<&ObjectPose> {
         match self {
-            Refusal::TooFewEdges { best } | Refusal::Ambiguous { best } => Some(best),
+            Refusal::TooFewEdges { best }
+            | Refusal::Ambiguous { best }
+            | Refusal::Lost { best, .. } => Some(best),
             _ => None,
         }
     }

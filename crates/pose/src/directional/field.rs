@@ -30,7 +30,7 @@ const STEP: f32 = PI / DIRECTIONS as f32;
 const SPREAD: usize = 4;
 
 /// The tables of one view.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Default)]
 pub struct Field {
     planes: Vec<Plane>,
 }
@@ -77,8 +77,8 @@ impl Field {
         if !(dx.is_finite() && dy.is_finite()) {
             return (0.0, 0.0);
         }
-        let plane = &self.planes[nearest_direction(dx, dy)];
-        plane.evidence(from, to, (dx * dx + dy * dy).sqrt())
+        let plane = self.planes.get(nearest_direction(dx, dy));
+        plane.map_or((0.0, 0.0), |p| p.evidence(from, to, (dx * dx + dy * dy).sqrt()))
     }
 
     /// The value (px) of one direction's field at a pixel, for pictures.

@@ -63,6 +63,10 @@ pub fn deviation(site: &Site, sd_px: f64) -> f64 {
     sd_px.hypot(form * site.px_per_metre)
 }
 
+/// What holds against an attitude in which nothing can rest, where gravity is known (nats): objects
+/// in a room stand or lie unless a hand holds them.
+const UNSUPPORTED: f64 = 6.0;
+
 /// How many independent measurements a site is worth.
 pub fn independent(site: &Site) -> f64 {
     (site.length / (CORRELATION_PX + CORRELATION * site.px_per_metre)).min(1.0)
@@ -297,7 +301,11 @@ impl Search<'_> {
         let weight = self.landmark_weight();
         let landmark = (residual.transpose() * weight * residual).x;
         let size = (state.log_size / SIZE_SD).powi(2);
-        let tilt = self.tilt(&state.pose).map_or(0.0, |t| (t.norm() / STANDING_SD).powi(2));
+        let tilt = match self.tilt(&state.pose) {
+            Some(turn) => (turn.norm() / STANDING_SD).powi(2),
+            None if self.query.up.is_some() && self.query.standing.is_none() => 2.0 * UNSUPPORTED,
+            None => 0.0,
+        };
         let own: f64 = (0..state.nuisances.len())
             .map(|v| {
                 let n = state.nuisances[v] - usual();
