@@ -13,6 +13,9 @@ pub const REACH: usize = 3;
 /// Filter output per grey level of a light whose image is a Gaussian of 0.68 px on a pixel centre.
 pub const GAIN: f32 = 12.03;
 
+/// What the box takes from a light, relative to what is left.
+pub const BOX_SHARE: f64 = 1.42 / 12.03;
+
 /// Standard deviation of the filter output per grey level of white pixel noise.
 pub const NOISE_GAIN: f32 = 10.4;
 

@@ -16,7 +16,7 @@ use nalgebra::{Matrix2, Point2};
 
 use super::Config;
 use super::evidence::{Evidence, Series, refine, unexplained, weigh};
-use super::front::BLOB_VARIANCE;
+use super::front::{BLOB_VARIANCE, BOX_SHARE};
 use super::history::History;
 use super::nuisance::{Nuisance, dot};
 use super::scan::{BlockNoise, Candidate, MARGIN};
@@ -245,35 +245,33 @@ impl Round<'_> {
         Some(Seen { place, evidence, series })
     }
 
-    /// Where the light is strongest near a place: logarithms of a Gaussian blob are a parabola.
+    /// Where the light is strongest near a place: on whole pixels, where nothing is interpolated, the
+    /// logarithms of a Gaussian blob and of its neighbours are a parabola.
     fn peak(&self, start: Point2<f64>, expected: &[f32], raw: &mut Vec<f32>) -> Point2<f64> {
-        const STEP: f64 = 0.5;
-        let mut at = |p: Point2<f64>| {
-            self.history.series(p, raw);
-            f64::from(dot(expected, raw)).max(1e-9).ln()
+        let far = |n: usize| n - 1 - MARGIN;
+        let mut at = |x: usize, y: usize| {
+            self.history.series_at((x, y), raw);
+            f64::from(dot(expected, raw))
         };
-        let mut place = start;
+        let (mut x, mut y) = (start.x.round() as usize, start.y.round() as usize);
         for _ in 0..3 {
-            let here = at(place);
-            let mut shift = [0.0; 2];
-            for (axis, s) in shift.iter_mut().enumerate() {
-                let mut side = |sign: f64| {
-                    let mut p = place;
-                    p[axis] += sign * STEP;
-                    at(p)
+            (x, y) = (x.clamp(MARGIN, far(self.size.0)), y.clamp(MARGIN, far(self.size.1)));
+            let around = [(x, y), (x - 1, y), (x + 1, y), (x, y - 1), (x, y + 1)];
+            let best = around.map(|(u, v)| (at(u, v), (u, v)));
+            let top = best.iter().fold(best[0], |a, b| if b.0 > a.0 { *b } else { a });
+            if top.1 == (x, y) {
+                // The box that the filter subtracts takes the same from all five.
+                let level = |k: usize| (best[k].0 + BOX_SHARE * best[0].0).max(1e-9).ln();
+                let offset = |before: usize, after: usize| {
+                    let curvature = level(before) - 2.0 * level(0) + level(after);
+                    let slope = level(before) - level(after);
+                    if curvature < -1e-9 { (0.5 * slope / curvature).clamp(-0.6, 0.6) } else { 0.0 }
                 };
-                let (before, after) = (side(-1.0), side(1.0));
-                let curvature = before - 2.0 * here + after;
-                *s = if curvature < 0.0 {
-                    (0.5 * STEP * (before - after) / curvature).clamp(-0.7, 0.7)
-                } else {
-                    0.7 * (after - before).signum()
-                };
+                return Point2::new(x as f64 + offset(1, 2), y as f64 + offset(3, 4));
             }
-            place.x = (place.x + shift[0]).clamp(MARGIN as f64, (self.size.0 - MARGIN) as f64);
-            place.y = (place.y + shift[1]).clamp(MARGIN as f64, (self.size.1 - MARGIN) as f64);
+            (x, y) = top.1;
         }
-        place
+        Point2::new(x as f64, y as f64)
     }
 
     /// Presence, quality of the fit, margins.
