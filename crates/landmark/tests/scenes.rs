@@ -1,5 +1,7 @@
 //! Whole finders against simulated scenes with known truth.
 
+#![allow(clippy::unwrap_used)]
+
 use std::time::Duration;
 
 use nalgebra::Point2;

@@ -49,6 +49,7 @@ impl History {
     }
 
     /// Number of frames.
+    #[allow(clippy::len_without_is_empty)]
     pub fn len(&self) -> usize {
         self.frames.len()
     }

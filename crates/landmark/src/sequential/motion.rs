@@ -81,9 +81,9 @@ fn fit(reference: &Image<f32>, half: &Image<f32>, guess: (f64, f64)) -> Placemen
         // The content moved by d: the frame shows at x what the reference shows at x - d.
         let moved = shifted(reference, -dx, -dy);
         let mut normal = [0.0f64; 7];
-        for y in 1..h - 1 {
+        for (y, &gain) in row_gain.iter().enumerate().take(h - 1).skip(1) {
             let rows = [moved.row(y - 1), moved.row(y), moved.row(y + 1)];
-            reduce(&accumulate(rows, half.row(y), row_gain[y], cut), &mut normal);
+            reduce(&accumulate(rows, half.row(y), gain, cut), &mut normal);
         }
         let [xx, xy, yy, xr, yr, rr, weight] = normal;
         let determinant = xx * yy - xy * xy;

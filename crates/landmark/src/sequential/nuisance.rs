@@ -130,7 +130,7 @@ pub fn strongest(table: &[f32], n: usize) -> Option<(Vec<f32>, Vec<f32>)> {
             next.iter_mut().zip(row).for_each(|(s, v)| *s += strength * v);
         }
         let length = dot(&next, &next).sqrt();
-        if !(length > 0.0) {
+        if length <= 0.0 || length.is_nan() {
             return None;
         }
         direction = next.iter().map(|v| v / length).collect();
