@@ -46,9 +46,11 @@ fn attribute(pdu: &mut [u8]) -> bool {
         Some(0x0A) => length == 3,
         Some(0x13 | 0x19 | 0x1E) => length == 1,
         Some(0x18) => length == 2,
-        // Find By Type Value; Read By Type and Read By Group Type with a 16- or 128-bit type.
+        // Find By Type Value; Read By Type with a 16- or 128-bit type. Groups have 16-bit types only,
+        // and trouble-host 0.8 reads one byte too many of a longer one.
         Some(0x06) => length >= 7,
-        Some(0x08 | 0x10) => length == 7 || length == 21,
+        Some(0x08) => length == 7 || length == 21,
+        Some(0x10) => length == 7,
         // Read Multiple: at least two handles.
         Some(0x0E | 0x20) => length >= 5 && length % 2 == 1,
         // Writes, notification, indication: a handle. Prepare Write: a handle and an offset.

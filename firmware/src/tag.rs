@@ -3,9 +3,7 @@
 //! ```text
 //!   advertise fast -> advertise slow -> link: serve, play -> (light off) -> advertise fast ...
 //! ```
-//! [`run`] never returns unless the controller fails; a board resets then. Pairing that failed ends
-//! the link and makes the tag wait before it advertises again, twice as long every time, so that the
-//! digits of a passkey cannot be tried out.
+//! [`run`] never returns unless the controller fails; a board resets then.
 
 use core::cell::{Cell, RefCell};
 use core::convert::Infallible;
@@ -36,10 +34,12 @@ use crate::store::{BONDS, Store};
 const FEEDING: Duration = Duration::from_secs(8);
 /// Time for the last packets of a link.
 const FAREWELL: Duration = Duration::from_millis(200);
+/// Longest time in which a link ends: the longest supervision timeout there is.
+const LONGEST_FAREWELL: Duration = Duration::from_secs(32);
 /// Wait after the first failed pairing; doubles with every further one.
-const FIRST_PENALTY: Duration = Duration::from_secs(1);
-/// Most doublings: 64 s.
-const LONGEST_PENALTY: u32 = 6;
+const FIRST_PENALTY: Duration = Duration::from_secs(2);
+/// Most doublings: 17 minutes, 6 hours for the 20 digits of a passkey.
+const LONGEST_PENALTY: u32 = 9;
 
 /// Why a tag stopped: its controller no longer answers.
 #[derive(Debug)]
@@ -58,7 +58,7 @@ struct Tag<'a, 'v, P: PacketPool, F: NorFlash, L, B, W> {
     record: &'a mut [u8; MAX_BYTES],
     object_id: Text,
     battery_level: Option<u8>,
-    failed_pairings: u32,
+    pairing: Pairing,
 }
 
 /// Runs a tag on a controller for ever. `P` is the memory pool of trouble-host; its packets must
@@ -109,7 +109,7 @@ where
         record: &mut record,
         object_id: Text::new(),
         battery_level: None,
-        failed_pairings: 0,
+        pairing: Pairing::default(),
     };
     let mut runner = stack.runner();
     let work = async {
@@ -122,6 +122,26 @@ where
         Either::First(Ok(())) => Err(Stopped(Error::InvalidState.into())),
         Either::First(Err(error)) => Err(Stopped(error)),
         Either::Second(result) => result,
+    }
+}
+
+/// Guesses at the passkey so far. Every failed pairing tells an attacker one more binary digit, so
+/// that the next one must wait, twice as long every time; everything else is served meanwhile.
+#[derive(Default)]
+struct Pairing {
+    failures: u32,
+    again: Option<Instant>,
+}
+
+impl Pairing {
+    fn failed(&mut self) {
+        let wait = FIRST_PENALTY * (1 << self.failures.min(LONGEST_PENALTY));
+        self.failures = self.failures.saturating_add(1);
+        self.again = Some(Instant::now() + wait);
+    }
+
+    fn allowed(&self) -> bool {
+        self.again.is_none_or(|again| Instant::now() >= again)
     }
 }
 
@@ -159,14 +179,19 @@ impl<P: PacketPool, F: NorFlash, L: Lights, B: Battery, W: Watchdog> Tag<'_, '_,
         let Ok(connection) = connection.with_attribute_server(&self.server.attributes) else {
             return Ok(());
         };
-        let paired = self.serve(&connection).await;
-        connection.raw().disconnect();
-        drop(connection);
-        self.failed_pairings = if paired { 0 } else { self.failed_pairings + 1 };
-        if self.failed_pairings > 0 {
-            let doublings = (self.failed_pairings - 1).min(LONGEST_PENALTY);
-            self.fed(Timer::after(FIRST_PENALTY * (1 << doublings))).await;
+        if self.serve(&connection).await {
+            return Ok(());
         }
+        connection.raw().disconnect();
+        // The one link must be gone before there can be another: a robot that connects too early
+        // would be refused, and would have ended the advertising.
+        let gone = async {
+            while !matches!(
+                connection.next().await,
+                GattConnectionEvent::Disconnected { .. }
+            ) {}
+        };
+        let _ = with_timeout(LONGEST_FAREWELL, self.fed(gone)).await;
         Ok(())
     }
 
@@ -222,10 +247,10 @@ impl<P: PacketPool, F: NorFlash, L: Lights, B: Battery, W: Watchdog> Tag<'_, '_,
         }
     }
 
-    /// Serves a robot until the link ends; false when a pairing failed. The light goes out with the
-    /// link.
+    /// Serves a robot until the link has ended (true) or is to be ended (false). The light goes out
+    /// with it.
     async fn serve(&mut self, connection: &GattConnection<'_, '_, P>) -> bool {
-        let Tag { config, server, remote, store, lights, watchdog, record, .. } = self;
+        let Tag { config, server, remote, store, lights, watchdog, record, pairing, .. } = self;
         let (config, server, remote) = (*config, *server, *remote);
         let battery = self.battery_level;
         let has_record = Cell::new(!self.object_id.is_empty());
@@ -240,7 +265,7 @@ impl<P: PacketPool, F: NorFlash, L: Lights, B: Battery, W: Watchdog> Tag<'_, '_,
                     Err(_) => {
                         watchdog.borrow_mut().feed();
                         if last.elapsed() >= config.idle_link && !remote.playing() {
-                            return true;
+                            return false;
                         }
                         continue;
                     }
@@ -250,13 +275,19 @@ impl<P: PacketPool, F: NorFlash, L: Lights, B: Battery, W: Watchdog> Tag<'_, '_,
                 match event {
                     GattConnectionEvent::Disconnected { .. } => return true,
                     GattConnectionEvent::PairingFailed(_) => {
+                        pairing.failed();
                         // The reason must reach the robot before the link ends.
                         Timer::after(FAREWELL).await;
                         return false;
                     }
-                    GattConnectionEvent::PairingComplete { bond: Some(bond), .. } => {
-                        // A bond that is not kept costs the robot another pairing.
-                        let _ = session.store.add_bond(&bond).await;
+                    // The passkey is about to be tried.
+                    GattConnectionEvent::PassKeyDisplay(_) if !pairing.allowed() => return false,
+                    GattConnectionEvent::PairingComplete { bond, .. } => {
+                        *pairing = Pairing::default();
+                        if let Some(bond) = bond {
+                            // A bond that is not kept costs the robot another pairing.
+                            let _ = session.store.add_bond(&bond).await;
+                        }
                     }
                     GattConnectionEvent::Gatt { event } => {
                         session.answer(event).await;
@@ -278,8 +309,8 @@ impl<P: PacketPool, F: NorFlash, L: Lights, B: Battery, W: Watchdog> Tag<'_, '_,
             }
         };
         let playing = led::play(*lights, remote, config.longest_play);
-        let good = match select3(requests, ends, playing).await {
-            Either3::First(good) => good,
+        let ended = match select3(requests, ends, playing).await {
+            Either3::First(ended) => ended,
             Either3::Second(never) => never,
             Either3::Third(never) => never,
         };
@@ -292,7 +323,7 @@ impl<P: PacketPool, F: NorFlash, L: Lights, B: Battery, W: Watchdog> Tag<'_, '_,
             self.lights.set(led, 0);
         }
         self.lights.playing(None);
-        good
+        ended
     }
 }
 

@@ -216,9 +216,10 @@ impl Medium {
         listener.wake();
     }
 
-    /// Connects the first initiator that waits for this advertiser.
+    /// Connects an initiator that waits for this advertiser; of several the fastest, which is a
+    /// matter of chance.
     fn answer(&mut self, advertiser: usize, from: Address) -> bool {
-        let initiator = (0..self.devices.len()).find(|other| {
+        let answers = |other: &usize| {
             let candidate = &self.devices[*other];
             let wanted = candidate.initiating.as_ref().is_some_and(|i| match i.peer {
                 Some(peer) => peer == from,
@@ -228,8 +229,13 @@ impl Medium {
                 self.rssi(advertiser, *other).is_some() && self.rssi(*other, advertiser).is_some()
             };
             *other != advertiser && wanted && both_ways()
-        });
-        let Some(initiator) = initiator else { return false };
+        };
+        let initiators: Vec<usize> = (0..self.devices.len()).filter(answers).collect();
+        let initiator = match initiators[..] {
+            [] => return false,
+            [only] => only,
+            _ => initiators[self.rng.random_range(0..initiators.len())],
+        };
         let Some(Initiating { own_address, timing, .. }) =
             self.devices[initiator].initiating.take()
         else {

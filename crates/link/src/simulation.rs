@@ -25,6 +25,8 @@ use crate::pool::HeapPool;
 
 /// Erase blocks of a tag's flash.
 const BLOCKS: usize = 4;
+/// Signal strength of guests (dBm).
+const GUEST_RSSI: i8 = -50;
 
 /// A tag of the simulation.
 #[derive(Debug, Clone, PartialEq)]
@@ -79,12 +81,24 @@ impl VirtualRadio {
         now: Duration,
         hearing: impl Fn(usize) -> Option<i8> + Send + 'static,
     ) -> Result<Self, DeviceError> {
+        Self::with_guests(config, tags, now, hearing, |_, _| {})
+    }
+
+    /// The same with devices of the caller's own on the air, which everybody hears at -50 dBm, or
+    /// with faults: `guests` is called on the radio's thread before anything runs.
+    pub fn with_guests(
+        config: RadioConfig,
+        tags: Vec<VirtualTag>,
+        now: Duration,
+        hearing: impl Fn(usize) -> Option<i8> + Send + 'static,
+        guests: impl FnOnce(&Executor, &Air) + Send + 'static,
+    ) -> Result<Self, DeviceError> {
         let (requests, incoming) = mpsc::channel();
         let logs: Vec<Log> = tags.iter().map(|_| Log::default()).collect();
         let thread_logs = logs.clone();
         let started = std::thread::Builder::new()
             .name("virtual radio".into())
-            .spawn(move || work(config, tags, thread_logs, now, hearing, &incoming));
+            .spawn(move || work(config, tags, thread_logs, now, hearing, guests, &incoming));
         started.map_err(|error| DeviceError::Disconnected {
             device: "virtual radio".into(),
             reason: error.to_string(),
@@ -163,25 +177,29 @@ fn work(
     logs: Vec<Log>,
     now: Duration,
     hearing: impl Fn(usize) -> Option<i8> + 'static,
+    guests: impl FnOnce(&Executor, &Air),
     requests: &Receiver<SimulatedRequest>,
 ) {
     time::use_virtual(now);
     let executor = Executor::new();
     let air = Air::new(config.air);
     let robot = air.controller([0, 0, 0, 0, 0, 1]);
-    let robot_id = robot.id();
-    let mut ids = vec![robot_id];
+    let mut ids = vec![robot.id()];
     for (tag, log) in tags.into_iter().zip(logs) {
         let controller = air.controller(tag.address.0);
         ids.push(controller.id());
         executor.spawn(run_tag(Hci::new(controller), tag, log));
     }
     air.set_hearing(move |from, to| {
-        let other = if from == robot_id { to } else { from };
-        // Tags do not listen to each other.
-        let tag = ids.iter().position(|id| *id == other)?.checked_sub(1)?;
-        (from == robot_id || to == robot_id).then(|| hearing(tag)).flatten()
+        let place = |device| ids.iter().position(|id| *id == device);
+        match (place(from), place(to)) {
+            // The robot comes first, the tags behind it; tags do not listen to each other.
+            (Some(0), Some(tag)) | (Some(tag), Some(0)) => hearing(tag - 1),
+            (Some(_), Some(_)) => None,
+            _ => Some(GUEST_RSSI),
+        }
     });
+    guests(&executor, &air);
     executor.spawn(air.run());
     let inbox = Inbox::default();
     executor.spawn(central::run(Hci::new(robot), config.link, inbox.clone()));
