@@ -5,7 +5,7 @@
     python3 scripts/check_dynamixel_sdk.py target/debug/examples/virtual_servo_bus
 
 Exit status 0 when every check holds. With --packets it prints what the SDK sends, byte by byte: the
-golden packets in crates/devices/src/dynamixel/golden.rs come from there.
+golden packets in crates/devices/src/dynamixel/packet.rs come from there.
 """
 
 import subprocess
@@ -66,8 +66,19 @@ def protocol_one(port):
     wait_for(lambda: handler.read2ByteTxRx(port, 1, 30)[0], 0x0320, "1.0 action obeyed")
 
 
+def keep_stuffing(handler):
+    """The SDK (4.1.0) stuffs a copy of the packet and then sends the original: make it send the copy."""
+    stuff = handler.addStuffing
+
+    def in_place(packet):
+        packet[:] = stuff(packet)
+
+    handler.addStuffing = in_place
+
+
 def protocol_two(port):
     handler = PacketHandler(2.0)
+    keep_stuffing(handler)
     check("2.0 ping", handler.ping(port, 11), (1060, COMM_SUCCESS, 0))
     found, result = handler.broadcastPing(port)
     check("2.0 broadcast ping", result, COMM_SUCCESS)
@@ -80,7 +91,7 @@ def protocol_two(port):
     check("2.0 goal out of range", handler.write4ByteTxRx(port, 11, 116, 5000)[1], 6)
     # FF FF FD in the data must be stuffed on the way in and on the way out. The place (indirect
     # data) means nothing to the servo.
-    for value in (0x00FDFFFF, 0xFDFFFF00, 0xFDFDFFFF - (1 << 32) & 0xFFFFFFFF):
+    for value in (0x00FDFFFF, 0xFDFFFF00, 0x12345678, 0xFDFDFFFF):
         check("2.0 stuffed write", handler.write4ByteTxRx(port, 11, 224, value), (COMM_SUCCESS, 0))
         check("2.0 stuffed read", handler.read4ByteTxRx(port, 11, 224), (value, COMM_SUCCESS, 0))
     group = GroupSyncWrite(port, handler, 116, 4)

@@ -75,7 +75,7 @@ fn attribute(pdu: &mut [u8]) -> bool {
 /// never reach the last handle, behind which a search could not continue.
 fn ascending(list: &[u8], item: u8, handles: usize) -> bool {
     let item = usize::from(item);
-    if list.is_empty() || list.len() % item != 0 {
+    if list.is_empty() || !list.len().is_multiple_of(item) {
         return false;
     }
     let mut last = 0;

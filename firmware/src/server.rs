@@ -29,9 +29,8 @@ pub struct Values {
     upload: [u8; UPLOAD_BYTES],
 }
 
-impl Values {
-    /// Empty values.
-    pub const fn new() -> Self {
+impl Default for Values {
+    fn default() -> Self {
         Values { record: [0; LONGEST_VALUE], rest: [0; LONGEST_VALUE], upload: [0; UPLOAD_BYTES] }
     }
 }

@@ -93,7 +93,7 @@ where
             let _ = stack.add_bond_information(bond);
         }
     }
-    let mut values = Values::new();
+    let mut values = Values::default();
     let server = Server::new(&mut values, config);
     let remote = Remote::default();
     let watchdog = RefCell::new(&mut board.watchdog);
@@ -186,10 +186,7 @@ impl<P: PacketPool, F: NorFlash, L: Lights, B: Battery, W: Watchdog> Tag<'_, '_,
         // The one link must be gone before there can be another: a robot that connects too early
         // would be refused, and would have ended the advertising.
         let gone = async {
-            while !matches!(
-                connection.next().await,
-                GattConnectionEvent::Disconnected { .. }
-            ) {}
+            while !matches!(connection.next().await, GattConnectionEvent::Disconnected { .. }) {}
         };
         let _ = with_timeout(LONGEST_FAREWELL, self.fed(gone)).await;
         Ok(())
@@ -380,12 +377,12 @@ impl<P: PacketPool, F: NorFlash> Session<'_, '_, P, F> {
 
     fn command(&mut self, data: &[u8]) -> Result<(), AttErrorCode> {
         let command = Command::decode(data).map_err(|_| error(gatt::ERROR_MALFORMED))?;
-        if let Command::Play { pattern, .. } = &command {
-            if pattern.landmark >= self.led_count {
+        match &command {
+            Command::Play { pattern, .. } if pattern.landmark >= self.led_count => {
                 return Err(error(gatt::ERROR_IMPOSSIBLE));
             }
+            _ => self.remote.send(command),
         }
-        self.remote.send(command);
         Ok(())
     }
 

@@ -8,7 +8,7 @@ use std::cell::RefCell;
 use std::collections::VecDeque;
 use std::future::poll_fn;
 use std::io::{self, Read, Write};
-use std::net::{TcpListener, TcpStream};
+use std::net::{Shutdown, TcpListener, TcpStream};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Poll, Waker};
 
@@ -107,6 +107,16 @@ fn packets(mut reader: impl Read + Send + 'static) -> Arc<Mailbox<Vec<u8>>> {
 pub struct StreamTransport<W> {
     incoming: Arc<Mailbox<Vec<u8>>>,
     writer: RefCell<W>,
+    socket: Option<TcpStream>,
+}
+
+impl<W> Drop for StreamTransport<W> {
+    fn drop(&mut self) {
+        // The reading thread holds the socket open, and waits in it, until somebody shuts it.
+        if let Some(socket) = &self.socket {
+            let _ = socket.shutdown(Shutdown::Both);
+        }
+    }
 }
 
 impl StreamTransport<TcpStream> {
@@ -115,14 +125,17 @@ impl StreamTransport<TcpStream> {
         let stream = TcpStream::connect(address)?;
         // Packets are short and answered at once.
         stream.set_nodelay(true)?;
-        Ok(StreamTransport::new(stream.try_clone()?, stream))
+        let socket = Some(stream.try_clone()?);
+        let mut transport = StreamTransport::new(stream.try_clone()?, stream);
+        transport.socket = socket;
+        Ok(transport)
     }
 }
 
 impl<W: Write> StreamTransport<W> {
     /// Over the two directions of a stream.
     pub fn new(reader: impl Read + Send + 'static, writer: W) -> Self {
-        StreamTransport { incoming: packets(reader), writer: RefCell::new(writer) }
+        StreamTransport { incoming: packets(reader), writer: RefCell::new(writer), socket: None }
     }
 }
 

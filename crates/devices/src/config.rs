@@ -23,6 +23,7 @@ use serde::Deserialize;
 use vergence_geometry::{Camera, CameraError, Distortion};
 
 use crate::dynamixel::DynamixelConfig;
+use crate::mjpeg::MjpegConfig;
 use crate::traits::Side;
 
 /// Why a configuration was refused.
@@ -108,6 +109,9 @@ pub struct CameraConfig {
     /// Distortion k1, k2, p1, p2, k3.
     #[serde(default)]
     pub distortion: [f64; 5],
+    /// For the driver `mjpeg`.
+    #[serde(default)]
+    pub mjpeg: Option<MjpegConfig>,
 }
 
 /// The servos' driver; what only one driver needs stands in the table of its name.

@@ -11,6 +11,7 @@ pub mod clock;
 pub mod config;
 pub mod description;
 pub mod dynamixel;
+pub mod mjpeg;
 mod traits;
 
 pub use arm::{Arm, ArmReading, Cancel, Execution, GripCommand, GripperReading, MotionLimits};

@@ -76,6 +76,16 @@ impl Part {
         })
     }
 
+    /// The library's shape, and where it sits in the part's frame.
+    pub fn shape(&self) -> (&SharedShape, &Transform) {
+        (&self.shape, &self.frame_from_shape)
+    }
+
+    /// The name for messages.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
     /// The same part in another frame.
     pub fn moved(&self, new_from_frame: &Transform) -> Self {
         Self { frame_from_shape: new_from_frame * self.frame_from_shape, ..self.clone() }

@@ -40,7 +40,7 @@ impl Plan {
         self.approach.waypoints.first().map(|w| w.positions)
     }
 
-    /// How far the lift takes the hand, in base (m).
+    /// What the lift does to the hand and what it holds, in base: `after_from_before`.
     pub fn lift_motion(&self, arm: &crate::kinematics::Arm) -> Option<Transform> {
         let (first, last) = (self.lift.waypoints.first()?, self.lift.waypoints.last()?);
         Some(arm.forward(&last.positions) * arm.forward(&first.positions).inverse())

@@ -8,6 +8,7 @@
 //! Search  -> where to look next until both heads see the light
 //! Fixator -> from the residual pixel to the next angles, until the light is centred
 //! triangulate / paper_distance -> where the light is
+//! calibrate -> the head as it is, from the head as it is described
 //! ```
 //!
 //! Pairs are in the order left, right. `angles` are always `[pan, tilt]`, pan positive to the left,
@@ -16,12 +17,15 @@
 // An index names a head or a joint in several arrays at once; zipped iterators would hide which.
 #![allow(clippy::needless_range_loop)]
 
+pub mod calibration;
+pub mod evaluation;
 mod fixation;
 mod kinematics;
 mod paper;
 mod search;
 mod triangulation;
 
+pub use calibration::{Calibration, CalibrationConfig, calibrate};
 pub use fixation::{Fixator, FixatorConfig, NextMove, dither};
 pub use kinematics::{HeadError, PanTiltHead};
 pub use paper::{PaperAngles, paper_distance};

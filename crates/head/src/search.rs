@@ -10,12 +10,12 @@
 //! - what no head has looked at counts full, what only the other head has looked at counts
 //!   [`SECOND_LOOK`] (the light may shine past one of them): so the heads first share the field, then
 //!   exchange halves;
-//! - samples near the prior place weigh more, so they come first, unless they are far to slew to;
+//! - samples near the prior place weigh so much that both heads look there first;
 //! - once one head has seen the light ([`Search::sighted`]), the samples are points along its line of
 //!   sight, near and likely distances first, and only the other head moves.
 //!
-//! No view is given twice. The first is where the heads look already, so a light in sight costs no
-//! move; the others lie on a grid that covers all that a head can reach.
+//! No view is given twice. Without a prior the first is where the heads look already, so a light in
+//! sight costs no move; the others lie on a grid that covers all that a head can reach.
 
 use nalgebra::{Point2, Point3, Vector3};
 use vergence_geometry::GaussianPoint;
@@ -24,8 +24,11 @@ use crate::PanTiltHead;
 
 /// Worth of a sample that the other head has looked at without success.
 const SECOND_LOOK: f64 = 0.05;
-/// Weight of a sample at the prior place against one anywhere.
-const PRIOR_GAIN: f64 = 50.0;
+/// Worth of a sample that the other head looks at in the same dwell: if the light is there, both have
+/// it at once.
+const SHARED_LOOK: f64 = 0.3;
+/// How much surer the prior is than all other places together: four times.
+const PRIOR_GAIN: f64 = 4.0;
 /// Smallest width of the prior (m): the object may have been pushed since.
 const PRIOR_WIDTH: f64 = 0.15;
 /// Points along a line of sight.
@@ -94,6 +97,7 @@ pub struct Search {
     samples: Vec<Sample>,
     views: [Vec<View>; 2],
     started: bool,
+    has_prior: bool,
     sighted: [bool; 2],
 }
 
@@ -112,6 +116,7 @@ impl Search {
             samples: field_samples(heads, field, prior, config),
             views: [vec![], vec![]],
             started: false,
+            has_prior: prior.is_some(),
             sighted: [false; 2],
         };
         search.views = [0, 1].map(|k| search.grid_of_views(k));
@@ -126,12 +131,14 @@ impl Search {
             let mut useful = false;
             for k in 0..2 {
                 let here = self.view(k, current[k]);
-                if !self.sighted[k] && !self.useless(k, &here) {
+                if self.has_prior {
+                    self.views[k].push(here);
+                } else if !self.sighted[k] && !self.useless(k, &here) {
                     useful = true;
                     here.covers.iter().for_each(|&i| self.samples[i as usize].seen[k] = true);
                 }
             }
-            if useful {
+            if useful && !self.has_prior {
                 return Some(current);
             }
         }
@@ -196,7 +203,7 @@ impl Search {
             .map(|angles| self.view(other, angles))
             .collect();
         // The light may be in the other's sight already: `next` first offers to stay.
-        self.started = false;
+        (self.started, self.has_prior) = (false, false);
     }
 
     /// True when `next` has nothing left to offer.
@@ -230,7 +237,9 @@ impl Search {
                 let sample = &self.samples[i as usize];
                 if sample.seen[head] {
                     0.0
-                } else if sample.seen[1 - head] || taken[i as usize] {
+                } else if taken[i as usize] {
+                    SHARED_LOOK * sample.weight
+                } else if sample.seen[1 - head] {
                     SECOND_LOOK * sample.weight
                 } else {
                     sample.weight
@@ -348,14 +357,21 @@ fn field_samples(
                 if !reachable {
                     continue;
                 }
-                // Solid angle; then how likely a light is there.
-                let mut weight = ct.max(0.05);
-                if let Some((place, inverse)) = &density {
-                    let off = point - place;
-                    weight *= 1.0 + PRIOR_GAIN * (-0.5 * off.dot(&(inverse * off))).exp();
-                }
+                // Solid angle.
+                let weight = ct.max(0.05);
                 samples.push(Sample { point, weight, seen: [false; 2] });
             }
+        }
+    }
+    if let Some((place, inverse)) = density {
+        let likely = |s: &Sample| {
+            let off = s.point - place;
+            s.weight * (-0.5 * off.dot(&(inverse * off))).exp()
+        };
+        let total: f64 = samples.iter().map(|s| s.weight).sum();
+        let mass: f64 = samples.iter().map(likely).sum();
+        for sample in &mut samples {
+            sample.weight += PRIOR_GAIN * total * likely(sample) / mass.max(f64::MIN_POSITIVE);
         }
     }
     samples
@@ -432,9 +448,7 @@ mod tests {
         let place = Point3::new(0.1, -1.0, 0.3);
         let prior = GaussianPoint { position: place, covariance: Matrix3::identity() * 1e-3 };
         let heads = heads();
-        let mut search = search(Some(&prior));
-        assert_eq!(search.next(at), Some(at));
-        let next = search.next(at).unwrap();
+        let next = search(Some(&prior)).next(at).unwrap();
         assert!((0..2).any(|k| heads[k].sees(next[k], &place, 20.0)), "{next:?}");
     }
 

@@ -207,6 +207,19 @@ fn midpoint(
     Ok(nalgebra::center(&rays[0].at(s), &rays[1].at(t)))
 }
 
+/// The point nearest to all rays, in the sense of least squares; `None` when they are parallel.
+pub(crate) fn nearest_to_rays(rays: &[Ray]) -> Option<Point3<f64>> {
+    let mut matrix = Matrix3::zeros();
+    let mut right = Vector3::zeros();
+    for ray in rays {
+        let d = ray.direction.into_inner();
+        let across = Matrix3::identity() - d * d.transpose();
+        matrix += across;
+        right += across * ray.origin.coords;
+    }
+    Some(Point3::from(matrix.try_inverse()? * right))
+}
+
 struct Problem<'a> {
     heads: &'a [PanTiltHead; 2],
     fixations: [&'a [Fixation]; 2],

@@ -5,54 +5,22 @@
 //! lets everything happen until the answer is there, and makes the robot's clock sleep for the time
 //! that it took. So a run is a function of its inputs, and no faster or slower machine changes it.
 //!
-//! A tag's light is known ahead: [`VirtualRadio::plays`] tells when each play begins and will end,
-//! unless a later command or a lost link ends it, which then is told in its place.
+//! A tag's light is known ahead: see [`Plays`].
 
+use std::sync::Arc;
 use std::sync::mpsc::{self, Receiver, Sender};
-use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use vergence_air::{Air, AirConfig, Executor, time};
-use vergence_devices::{Clock, DeviceError, TagAddress};
-use vergence_firmware::{Battery, Board, Config, Lights, Store, Watchdog};
-use vergence_tag::Pattern;
+use vergence_devices::{Clock, DeviceError};
 
 use crate::central::{self, LinkConfig};
-use crate::flash::MemoryFlash;
 use crate::hci::{Hci, HciLink, SimulatedRequest};
 use crate::job::{Fault, Inbox};
-use crate::pool::HeapPool;
+use crate::virtual_tag::{Plays, VirtualTag, spawn_tags};
 
-/// Erase blocks of a tag's flash.
-const BLOCKS: usize = 4;
 /// Signal strength of guests (dBm).
 const GUEST_RSSI: i8 = -50;
-
-/// A tag of the simulation.
-#[derive(Debug, Clone, PartialEq)]
-pub struct VirtualTag {
-    /// Its address.
-    pub address: TagAddress,
-    /// Its record (CBOR); empty for a tag that was never written.
-    pub record: Vec<u8>,
-    /// Its LEDs.
-    pub lights: u8,
-    /// Battery level (percent).
-    pub battery: u8,
-    /// The owner's choices; its address is replaced by the one above.
-    pub config: Config<'static>,
-}
-
-/// The light of a tag over some time, on the robot's clock.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct LightPlay {
-    /// When the first chip begins.
-    pub begin: Duration,
-    /// When the light goes out for good.
-    pub end: Duration,
-    /// What is played.
-    pub pattern: Pattern,
-}
 
 /// How the simulated radio behaves.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -63,12 +31,10 @@ pub struct RadioConfig {
     pub link: LinkConfig,
 }
 
-type Log = Arc<Mutex<Vec<LightPlay>>>;
-
 /// Tags, robot and air.
 pub struct VirtualRadio {
     requests: Sender<SimulatedRequest>,
-    logs: Vec<Log>,
+    plays: Plays,
 }
 
 impl VirtualRadio {
@@ -94,16 +60,16 @@ impl VirtualRadio {
         guests: impl FnOnce(&Executor, &Air) + Send + 'static,
     ) -> Result<Self, DeviceError> {
         let (requests, incoming) = mpsc::channel();
-        let logs: Vec<Log> = tags.iter().map(|_| Log::default()).collect();
-        let thread_logs = logs.clone();
+        let plays = Plays::new(tags.len());
+        let thread_plays = plays.clone();
         let started = std::thread::Builder::new()
             .name("virtual radio".into())
-            .spawn(move || work(config, tags, thread_logs, now, hearing, guests, &incoming));
+            .spawn(move || work(config, tags, thread_plays, now, hearing, guests, &incoming));
         started.map_err(|error| DeviceError::Disconnected {
             device: "virtual radio".into(),
             reason: error.to_string(),
         })?;
-        Ok(VirtualRadio { requests, logs })
+        Ok(VirtualRadio { requests, plays })
     }
 
     /// The robot's radio. Its calls move `clock` ahead by the time that they take.
@@ -111,70 +77,17 @@ impl VirtualRadio {
         HciLink::simulated(self.requests.clone(), clock)
     }
 
-    /// All plays of a tag so far, in order of time.
-    pub fn plays(&self, tag: usize) -> Vec<LightPlay> {
-        let lock = |log: &Log| log.lock().unwrap_or_else(PoisonError::into_inner).clone();
-        self.logs.get(tag).map(lock).unwrap_or_default()
+    /// The light of the tags.
+    pub fn plays(&self) -> &Plays {
+        &self.plays
     }
-
-    /// Forgets plays that ended before a time, which no frame can show any more.
-    pub fn forget_plays_before(&self, time: Duration) {
-        for log in &self.logs {
-            log.lock().unwrap_or_else(PoisonError::into_inner).retain(|play| play.end >= time);
-        }
-    }
-}
-
-/// Lights whose plays are written down.
-struct LoggedLights {
-    count: u8,
-    log: Log,
-}
-
-impl Lights for LoggedLights {
-    fn count(&self) -> u8 {
-        self.count
-    }
-
-    fn set(&mut self, _led: u8, _level: u8) {}
-
-    fn playing(&mut self, play: Option<&vergence_firmware::Play>) {
-        let mut log = self.log.lock().unwrap_or_else(PoisonError::into_inner);
-        let at = |instant: embassy_time::Instant| Duration::from_micros(instant.as_micros());
-        match play {
-            Some(play) => log.push(LightPlay {
-                begin: at(play.begin),
-                end: at(play.end),
-                pattern: play.pattern,
-            }),
-            None => {
-                if let Some(last) = log.last_mut() {
-                    last.end = last.end.min(time::now()).max(last.begin);
-                }
-            }
-        }
-    }
-}
-
-struct FixedBattery(u8);
-
-impl Battery for FixedBattery {
-    fn level(&mut self) -> Option<u8> {
-        Some(self.0)
-    }
-}
-
-struct NoWatchdog;
-
-impl Watchdog for NoWatchdog {
-    fn feed(&mut self) {}
 }
 
 /// The radio's thread.
 fn work(
     config: RadioConfig,
     tags: Vec<VirtualTag>,
-    logs: Vec<Log>,
+    plays: Plays,
     now: Duration,
     hearing: impl Fn(usize) -> Option<i8> + 'static,
     guests: impl FnOnce(&Executor, &Air),
@@ -185,11 +98,7 @@ fn work(
     let air = Air::new(config.air);
     let robot = air.controller([0, 0, 0, 0, 0, 1]);
     let mut ids = vec![robot.id()];
-    for (tag, log) in tags.into_iter().zip(logs) {
-        let controller = air.controller(tag.address.0);
-        ids.push(controller.id());
-        executor.spawn(run_tag(Hci::new(controller), tag, log));
-    }
+    ids.extend(spawn_tags(&executor, &air, tags, &plays));
     air.set_hearing(move |from, to| {
         let place = |device| ids.iter().position(|id| *id == device);
         match (place(from), place(to)) {
@@ -216,27 +125,4 @@ fn work(
         // Whoever no longer waits does not want the outcome.
         let _ = reply.send((outcome.unwrap_or_else(stalled), time::now()));
     }
-}
-
-/// One tag: the firmware on a board of memory.
-async fn run_tag(controller: Hci<vergence_air::Controller>, tag: VirtualTag, log: Log) {
-    let flash = MemoryFlash::new(BLOCKS);
-    let range = flash.range();
-    let Ok(mut store) = Store::new(flash, range) else { return };
-    if !tag.record.is_empty() && store.set_record(&tag.record).await.is_err() {
-        return;
-    }
-    let mut address = tag.address.0;
-    address.reverse();
-    let config = Config { address, ..tag.config };
-    let mut board = Board {
-        lights: LoggedLights { count: tag.lights, log },
-        battery: FixedBattery(tag.battery),
-        watchdog: NoWatchdog,
-    };
-    // A virtual controller does not fail.
-    let _ = vergence_firmware::run::<_, HeapPool, _, _, _, _>(
-        controller, &config, &mut store, &mut board,
-    )
-    .await;
 }

@@ -92,7 +92,10 @@ fn channel_cases() -> Vec<(String, Vec<Act>)> {
     cases.push(("stray continuation".into(), vec![Fragment(false, vec![1; 20]), Pause]));
     cases.push(("empty continuation".into(), vec![Fragment(false, vec![]), Pause]));
     let half = Fragment(true, vec![200, 0, 4, 0, 0x12, 3, 0]);
-    cases.push(("half a frame, then another".into(), [vec![half.clone()], att(&[0x0A, 3, 0])].concat()));
+    cases.push((
+        "half a frame, then another".into(),
+        [vec![half.clone()], att(&[0x0A, 3, 0])].concat(),
+    ));
     cases.push(("half a frame, then gone".into(), vec![half.clone(), Leave]));
     let endless = std::iter::once(half).chain((0..50).map(|_| Fragment(false, vec![0; 251])));
     cases.push(("endless frame".into(), endless.chain([Pause]).collect()));

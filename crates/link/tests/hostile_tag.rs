@@ -23,9 +23,12 @@ fn error(request: &[u8], code: u8) -> Vec<(u16, Vec<u8>)> {
 /// Where a rogue that behaves for a while says that its characteristics are.
 fn declarations() -> Vec<u8> {
     let mut answer = vec![0x09, 21];
-    for (handle, properties, uuid) in
-        [(2u16, 2u8, gatt::RECORD), (4, 8, gatt::RECORD_WRITE), (6, 8, gatt::COMMAND), (8, 2, gatt::STATE)]
-    {
+    for (handle, properties, uuid) in [
+        (2u16, 2u8, gatt::RECORD),
+        (4, 8, gatt::RECORD_WRITE),
+        (6, 8, gatt::COMMAND),
+        (8, 2, gatt::STATE),
+    ] {
         answer.extend(handle.to_le_bytes());
         answer.push(properties);
         answer.extend((handle + 1).to_le_bytes());
@@ -45,7 +48,11 @@ fn polite(request: &[u8]) -> Option<Vec<(u16, Vec<u8>)>> {
 
 fn value(request: &[u8], value: &[u8]) -> Vec<(u16, Vec<u8>)> {
     match request[0] {
-        0x08 => vec![(4, [&[0x09, (value.len().min(243) + 2) as u8, 3, 0][..], &value[..value.len().min(243)]].concat())],
+        0x08 => vec![(
+            4,
+            [&[0x09, (value.len().min(243) + 2) as u8, 3, 0][..], &value[..value.len().min(243)]]
+                .concat(),
+        )],
         0x0C => {
             let at = usize::from(u16::from_le_bytes([request[3], request[4]]));
             let part = value.get(at..).unwrap_or_default();
@@ -76,34 +83,141 @@ fn cases() -> Vec<(&'static str, Answers, Expected)> {
         ("error to everything", |r| error(r, 0x0E), Refused),
         ("error with a stray code", |r| error(r, 0x00), Error),
         ("short error", |r| vec![(4, vec![0x01, r[0]])], Silence),
-        ("MTU zero, then mute", |r| if r[0] == 2 { vec![(4, vec![3, 0, 0])] } else { vec![] }, Silence),
+        (
+            "MTU zero, then mute",
+            |r| if r[0] == 2 { vec![(4, vec![3, 0, 0])] } else { vec![] },
+            Silence,
+        ),
         ("short MTU answer", |_| vec![(4, vec![3, 1])], Silence),
         ("opcode alone", |r| vec![(4, vec![r[0] + 1])], Silence),
         ("answers of another kind", |r| polite(r).unwrap_or(vec![(4, vec![0x13])]), Error),
-        ("items of no length", |r| polite(r).filter(|_| r[0] == 2).unwrap_or(vec![(4, vec![0x09, 0, 1, 0])]), Silence),
-        ("items of one byte", |r| polite(r).filter(|_| r[0] == 2).unwrap_or(vec![(4, vec![0x09, 1, 1, 0])]), Silence),
-        ("no items", |r| polite(r).filter(|_| r[0] == 2).unwrap_or(vec![(4, vec![0x09, 7])]), Silence),
-        ("last handle", |r| polite(r).filter(|_| r[0] == 2).unwrap_or(vec![(4, vec![0x09, 4, 0xFF, 0xFF, 1, 2])]), Silence),
-        ("the first handle for ever", |r| polite(r).filter(|_| r[0] == 2).unwrap_or(vec![(4, vec![0x09, 9, 1, 0, 2, 2, 0, 0, 0x2A, 1, 2])]), Error),
+        (
+            "items of no length",
+            |r| polite(r).filter(|_| r[0] == 2).unwrap_or(vec![(4, vec![0x09, 0, 1, 0])]),
+            Silence,
+        ),
+        (
+            "items of one byte",
+            |r| polite(r).filter(|_| r[0] == 2).unwrap_or(vec![(4, vec![0x09, 1, 1, 0])]),
+            Silence,
+        ),
+        (
+            "no items",
+            |r| polite(r).filter(|_| r[0] == 2).unwrap_or(vec![(4, vec![0x09, 7])]),
+            Silence,
+        ),
+        (
+            "last handle",
+            |r| {
+                polite(r)
+                    .filter(|_| r[0] == 2)
+                    .unwrap_or(vec![(4, vec![0x09, 4, 0xFF, 0xFF, 1, 2])])
+            },
+            Silence,
+        ),
+        (
+            "the first handle for ever",
+            |r| {
+                polite(r)
+                    .filter(|_| r[0] == 2)
+                    .unwrap_or(vec![(4, vec![0x09, 9, 1, 0, 2, 2, 0, 0, 0x2A, 1, 2])])
+            },
+            Error,
+        ),
         ("record of nothing", |r| polite(r).unwrap_or_else(|| value(r, &[])), Refused),
-        ("endless record", |r| polite(r).unwrap_or_else(|| match r[0] {
-            0x0C => vec![(4, [&[0x0D][..], &[7; 246]].concat())],
-            _ => value(r, &[7; 500]),
-        }), Error),
-        ("record of another object", |r| polite(r).unwrap_or_else(|| value(r, &record("can"))), Refused),
-        ("record, but other channels", |r| polite(r).map(|mut a| { a.insert(0, (0x40, vec![1; 9])); a }).unwrap_or_else(|| vec![(6, vec![0x0B, 5])]), Silence),
-        ("signals between", |r| polite(r).map(|mut a| { a.insert(0, (5, vec![0x12, 1, 8, 0, 6, 0, 6, 0, 0, 0, 100, 0])); a }).unwrap_or_default(), Silence),
-        ("impossible timing", |r| polite(r).map(|mut a| { a.insert(0, (5, vec![0x12, 1, 8, 0, 0xFF, 0xFF, 0, 0, 0xFF, 0xFF, 0, 0])); a }).unwrap_or_default(), Silence),
-        ("flood of notifications", |r| {
-            let mut flood = vec![(4, vec![0x1B, 9, 0, 1]); 500];
-            flood.extend(polite(r).unwrap_or_default());
-            flood
-        }, Silence),
+        (
+            "endless record",
+            |r| {
+                polite(r).unwrap_or_else(|| match r[0] {
+                    0x0C => vec![(4, [&[0x0D][..], &[7; 246]].concat())],
+                    _ => value(r, &[7; 500]),
+                })
+            },
+            Error,
+        ),
+        (
+            "record of another object",
+            |r| polite(r).unwrap_or_else(|| value(r, &record("can"))),
+            Refused,
+        ),
+        (
+            "record, but other channels",
+            |r| {
+                polite(r)
+                    .map(|mut a| {
+                        a.insert(0, (0x40, vec![1; 9]));
+                        a
+                    })
+                    .unwrap_or_else(|| vec![(6, vec![0x0B, 5])])
+            },
+            Silence,
+        ),
+        (
+            "signals between",
+            |r| {
+                polite(r)
+                    .map(|mut a| {
+                        a.insert(0, (5, vec![0x12, 1, 8, 0, 6, 0, 6, 0, 0, 0, 100, 0]));
+                        a
+                    })
+                    .unwrap_or_default()
+            },
+            Silence,
+        ),
+        (
+            "impossible timing",
+            |r| {
+                polite(r)
+                    .map(|mut a| {
+                        a.insert(0, (5, vec![0x12, 1, 8, 0, 0xFF, 0xFF, 0, 0, 0xFF, 0xFF, 0, 0]));
+                        a
+                    })
+                    .unwrap_or_default()
+            },
+            Silence,
+        ),
+        (
+            "flood of notifications",
+            |r| {
+                let mut flood = vec![(4, vec![0x1B, 9, 0, 1]); 500];
+                flood.extend(polite(r).unwrap_or_default());
+                flood
+            },
+            Silence,
+        ),
         ("flood of indications", |_| vec![(4, vec![0x1D, 9, 0, 1]); 500], Silence),
-        ("asks back", |_| vec![(4, vec![0x0A, 3, 0]), (4, vec![0x08, 1, 0, 0xFF, 0xFF, 0, 0x28])], Silence),
-        ("every answer twice", |r| { let a = polite(r).unwrap_or_else(|| value(r, &[7; 9])); [a.clone(), a].concat() }, Error),
-        ("wants to pair", |r| [vec![(6, vec![0x0B, 0x0D])], polite(r).unwrap_or_default()].concat(), Silence),
-        ("pairs nonsense", |r| [vec![(6, vec![0x02, 3, 0, 9, 16, 0, 0]), (6, [&[0x0C][..], &[0x55; 64]].concat())], polite(r).unwrap_or_default()].concat(), Silence),
+        (
+            "asks back",
+            |_| vec![(4, vec![0x0A, 3, 0]), (4, vec![0x08, 1, 0, 0xFF, 0xFF, 0, 0x28])],
+            Silence,
+        ),
+        (
+            "every answer twice",
+            |r| {
+                let a = polite(r).unwrap_or_else(|| value(r, &[7; 9]));
+                [a.clone(), a].concat()
+            },
+            Error,
+        ),
+        (
+            "wants to pair",
+            |r| [vec![(6, vec![0x0B, 0x0D])], polite(r).unwrap_or_default()].concat(),
+            Silence,
+        ),
+        (
+            "pairs nonsense",
+            |r| {
+                [
+                    vec![
+                        (6, vec![0x02, 3, 0, 9, 16, 0, 0]),
+                        (6, [&[0x0C][..], &[0x55; 64]].concat()),
+                    ],
+                    polite(r).unwrap_or_default(),
+                ]
+                .concat()
+            },
+            Silence,
+        ),
     ]
 }
 
@@ -156,7 +270,9 @@ fn rogue_answers_do_not_harm() {
             Ok(bytes) => panic!("{name}: {bytes:?}"),
         };
         match expected {
-            Expected::Refused => assert!(matches!(error, DeviceError::Fault { .. }), "{name}: {error}"),
+            Expected::Refused => {
+                assert!(matches!(error, DeviceError::Fault { .. }), "{name}: {error}")
+            }
             Expected::Silence => assert!(
                 matches!(error, DeviceError::Timeout { .. } | DeviceError::Disconnected { .. }),
                 "{name}: {error}"
@@ -168,7 +284,11 @@ fn rogue_answers_do_not_harm() {
         let _ = link.command(ROGUE, LedCommand::Play(pattern), TIMEOUT);
         let _ = link.info(ROGUE, TIMEOUT);
         let _ = link.pair(ROGUE, None);
-        assert_eq!(link.read_record(address(1), TIMEOUT).unwrap(), record("kettle"), "after {name}");
+        assert_eq!(
+            link.read_record(address(1), TIMEOUT).unwrap(),
+            record("kettle"),
+            "after {name}"
+        );
     }
 }
 

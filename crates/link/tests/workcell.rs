@@ -43,7 +43,7 @@ fn a_robot_finds_reads_and_commands() {
 
     let state = w.link.command(address(1), LedCommand::Play(flicker()), TIMEOUT).unwrap();
     assert!(state.playing);
-    let plays = w.radio.plays(0);
+    let plays = w.radio.plays().of(0);
     assert_eq!(plays.len(), 1);
     assert_eq!(plays[0].pattern, flicker());
     assert!(plays[0].begin <= w.clock.now() && plays[0].begin > before);
@@ -52,7 +52,7 @@ fn a_robot_finds_reads_and_commands() {
     w.clock.sleep(Duration::from_secs(3));
     let state = w.link.command(address(1), LedCommand::Stop, TIMEOUT).unwrap();
     assert!(!state.playing);
-    let [play] = w.radio.plays(0)[..] else { panic!("one play") };
+    let [play] = w.radio.plays().of(0)[..] else { panic!("one play") };
     assert!(play.end < w.clock.now() && play.end > play.begin + Duration::from_secs(3));
 }
 
@@ -78,7 +78,7 @@ fn calls_end_in_time_when_nobody_answers() {
     let start = w.clock.now();
     assert!(w.link.scan(Duration::from_secs(3)).unwrap().is_empty());
     // The link is lost after its supervision timeout of two seconds, and the light with it.
-    let [play] = w.radio.plays(0)[..] else { panic!("one play") };
+    let [play] = w.radio.plays().of(0)[..] else { panic!("one play") };
     let dark = play.end.saturating_sub(start);
     assert!(dark > Duration::from_millis(1900) && dark < Duration::from_millis(2200), "{dark:?}");
     let lost = w.link.command(address(1), LedCommand::Stop, Duration::from_secs(1)).unwrap_err();
@@ -96,7 +96,7 @@ fn plays_end_by_themselves() {
     w.clock.sleep(Duration::from_secs(1));
     let state = w.link.play_for(address(1), flicker(), Duration::from_secs(2), TIMEOUT).unwrap();
     assert!(state.playing);
-    let lengths: Vec<_> = w.radio.plays(0).iter().map(|p| p.end - p.begin).collect();
+    let lengths: Vec<_> = w.radio.plays().of(0).iter().map(|p| p.end - p.begin).collect();
     assert_eq!(lengths, [Duration::from_millis(300), Duration::from_secs(2)]);
     w.clock.sleep(Duration::from_secs(3));
     assert!(!w.link.info(address(1), TIMEOUT).unwrap().playing);
@@ -111,7 +111,7 @@ fn what_a_tag_cannot_do_it_refuses() {
     let second = Pattern { landmark: 1, ..flicker() };
     let refused = w.link.command(address(1), LedCommand::Play(second), TIMEOUT).unwrap_err();
     assert!(matches!(&refused, DeviceError::Fault { fault, .. } if fault.contains("cannot")));
-    assert!(w.radio.plays(0).is_empty());
+    assert!(w.radio.plays().of(0).is_empty());
 }
 
 fn owned(id: &str, number: u8, passkey: Option<u32>, access: Access) -> VirtualTag {
@@ -229,7 +229,7 @@ fn a_run_repeats_exactly() {
         let bytes = w.link.read_record(address(2), TIMEOUT).unwrap();
         w.link.command(address(3), LedCommand::Play(flicker()), TIMEOUT).unwrap();
         w.link.command(address(1), LedCommand::Play(flicker()), TIMEOUT).unwrap();
-        (heard, bytes, w.radio.plays(0), w.radio.plays(2), w.clock.now())
+        (heard, bytes, w.radio.plays().of(0), w.radio.plays().of(2), w.clock.now())
     };
     assert_eq!(run(), run());
 }

@@ -24,8 +24,11 @@ use field::Field;
 use level::{Level, Region};
 use refine::{EDGE_SD_PX, Pass, Refined};
 use search::{Search, Sight};
-use sites::{Layout, Site};
+use sites::Site;
 use verdict::Explained;
+
+/// Alternatives reported.
+const MOST_ALTERNATIVES: usize = 4;
 
 /// Settings of the directional method.
 #[derive(Debug, Clone, PartialEq)]
@@ -37,15 +40,21 @@ pub struct Config {
     pub grid_spacing: f64,
     /// Step of a standing object's turn about the vertical (rad).
     pub turn_step: f64,
+    /// Rotations that the other views judge after the first has ranked all.
+    pub shortlist: usize,
     /// Hypotheses improved on the fields.
     pub seeds: usize,
     /// Halvings of the step while improving, from half the grid's spacing.
     pub climb_halvings: usize,
-    /// Hypotheses refined on the pictures.
+    /// Hypotheses refined on the pictures at the working scale.
     pub refined: usize,
+    /// Of those, how many are refined at full resolution.
+    pub finalists: usize,
     /// Cosine between the landmark's normal and the line of sight below which no camera sees it.
     pub grazing: f64,
-    /// Poses that differ by more than this turn (rad) count as different.
+    /// Roughly refined poses nearer than this (rad) are one: the finer refinement joins them.
+    pub distinct: f64,
+    /// Poses that differ by more than this turn (rad) count as different in the verdict.
     pub different: f64,
     /// Share of the contour that must lie on edges.
     pub least_coverage: f64,
@@ -56,16 +65,19 @@ pub struct Config {
 impl Default for Config {
     fn default() -> Self {
         Config {
-            reach_px: 110.0,
-            grid_spacing: 8f64.to_radians(),
+            reach_px: 115.0,
+            grid_spacing: 9f64.to_radians(),
             turn_step: 3f64.to_radians(),
-            seeds: 48,
+            shortlist: 400,
+            seeds: 32,
             climb_halvings: 3,
-            refined: 10,
+            refined: 16,
+            finalists: 10,
             grazing: 0.1,
+            distinct: 2f64.to_radians(),
             different: 6f64.to_radians(),
             least_coverage: 0.5,
-            least_confidence: 0.6,
+            least_confidence: 0.9,
         }
     }
 }
@@ -101,10 +113,11 @@ pub fn recognise_traced<'a>(
     }
     let search = Search { sights: &sights, model: &model, query, landmark, normal, config };
     let hypotheses = search.hypotheses();
-    let mut refined: Vec<(Refined, Explained)> =
-        hypotheses.iter().map(|h| search.refine_and_weigh(&h.pose)).collect();
-    refined.sort_by(|a, b| b.1.evidence.total_cmp(&a.1.evidence));
-    let different = search.different(refined);
+    let rough = hypotheses.iter().map(|h| search.refine_roughly(&h.pose)).collect();
+    let rough = search.ranked(rough, config.distinct);
+    let finalists = rough.iter().take(config.finalists);
+    let fine = finalists.map(|(rough, _)| search.refine_finely(rough.clone())).collect();
+    let different = search.ranked(fine, config.different);
     let result = search.verdict(&different);
     let poses = different.iter().map(|(r, _)| r.pose).collect();
     let sites = different.into_iter().next().map(|(r, _)| r.sites).unwrap_or_default();
@@ -138,54 +151,99 @@ fn prepare<'a>(
             let coarse = Level::new(view.image, &region, scale);
             let fine = (scale > 1).then(|| Level::new(view.image, &region, 1));
             let field = Field::new(&edges::edgels(&coarse), coarse.width(), coarse.height());
-            Some(Sight { view: *view, optical_from_base, coarse, fine, field })
+            let straight = view.camera.distortion.is_none();
+            Some(Sight { view: *view, optical_from_base, straight, coarse, fine, field })
         })
         .collect()
 }
 
 impl Search<'_> {
-    fn refine_and_weigh(&self, start: &Transform) -> (Refined, Explained) {
-        let scale = self.sights.iter().map(|s| s.coarse.scale).max().unwrap_or(1) as f64;
-        let pass = |sd: f64, range: f64, spacing: f64, fine: bool| Pass {
-            sd_px: sd,
-            layout: Layout { spacing_px: spacing, range_px: range },
-            fine,
-        };
-        let mut passes = vec![
-            pass(2.5 * scale, 7.0 * scale, 3.0 * scale, false),
-            pass(1.5 * scale, 5.0 * scale, 3.0 * scale, false),
-            pass(1.0 * scale, 4.0 * scale, 2.0 * scale, false),
-        ];
-        let mut s = scale;
+    /// Pixels of the picture to one of the working scale.
+    fn scale(&self) -> f64 {
+        self.sights.iter().map(|s| s.coarse.scale).max().unwrap_or(1) as f64
+    }
+
+    /// Refinement at the working scale, wide and coarse: enough to tell which hypothesis is right.
+    fn refine_roughly(&self, start: &Transform) -> (Refined, Explained) {
+        let s = self.scale();
+        let passes = [(2.5, 7.0, 4.0), (1.5, 5.0, 4.0), (1.0, 4.0, 3.0)]
+            .map(|(sd, range, spacing)| Pass::new(s * sd, s * range, s * spacing, false));
+        let mut refined = Refined::new(start, self.sights.len());
+        self.refine(&mut refined, &passes);
+        self.weigh(refined, &Pass::new(0.5 * s, 4.0 * s, 3.0 * s, false))
+    }
+
+    /// Refinement down to full resolution.
+    fn refine_finely(&self, mut refined: Refined) -> (Refined, Explained) {
+        let mut passes = Vec::new();
+        let mut s = self.scale();
         while s > 1.0 {
             s /= 2.0;
-            passes.push(pass(1.0 * s, 4.0 * s, 2.0 * s, true));
+            passes.push(Pass::new(s, 4.0 * s, 2.5 * s, true));
         }
-        passes.push(pass(0.7, 4.0, 1.5, true));
-        passes.push(pass(0.5, 4.0, 1.5, true));
-        let last = pass(EDGE_SD_PX, 4.0, 1.5, true);
-        passes.push(last);
-        let mut refined = self.refine(start, &passes);
-        self.lay_out(&mut refined, &last);
-        let mut explained = verdict::weigh(&refined.sites, last.layout.range_px, 0.4);
+        passes.push(Pass::new(0.6, 4.0, 2.5, true));
+        passes.push(Pass::new(EDGE_SD_PX, 4.0, 2.0, true));
+        passes.push(Pass::new(EDGE_SD_PX, 4.0, 2.0, true));
+        self.refine(&mut refined, &passes);
+        // Print is fine, outlines are coarse: both scales have their say in what is explained.
+        let s = self.scale();
+        let (refined, coarse) = self.weigh(refined, &Pass::new(0.5 * s, 4.0 * s, 2.0 * s, false));
+        let (refined, mut fine) = self.weigh(refined, &Pass::new(0.4, 4.0, 2.0, true));
+        fine.evidence = 0.5 * (fine.evidence + coarse.evidence);
+        fine.coverage = fine.coverage.min(coarse.coverage);
+        (refined, fine)
+    }
+
+    /// What a refined pose explains, priors included.
+    fn weigh(&self, mut refined: Refined, pass: &Pass) -> (Refined, Explained) {
+        self.lay_out(&mut refined, pass);
+        let mut explained = verdict::weigh(&refined.sites, pass.layout.range_px, pass.sd_px);
         explained.evidence -= refined.strain;
         (refined, explained)
     }
 
-    /// Of a list that is sorted best first, those that differ from every better one.
-    fn different(&self, sorted: Vec<(Refined, Explained)>) -> Vec<(Refined, Explained)> {
+    /// Best first, without those less than `apart` (rad) from a better one.
+    fn ranked(
+        &self,
+        mut found: Vec<(Refined, Explained)>,
+        apart: f64,
+    ) -> Vec<(Refined, Explained)> {
+        found.sort_by(|a, b| b.1.evidence.total_cmp(&a.1.evidence));
         let symmetry = self.query.symmetry();
         let mut kept: Vec<(Refined, Explained)> = Vec::new();
-        for candidate in sorted {
+        for candidate in found {
             let turn = &candidate.0.pose.rotation;
-            let away = |k: &(Refined, Explained)| {
-                symmetry.angle_between(&k.0.pose.rotation, turn) > self.config.different
-            };
+            let away =
+                |k: &(Refined, Explained)| symmetry.angle_between(&k.0.pose.rotation, turn) > apart;
             if kept.iter().all(away) {
                 kept.push(candidate);
             }
         }
         kept
+    }
+
+    /// Poses whose contour is the same but for the tolerance of form, with their odds against this
+    /// one: only the landmark's place can tell them apart.
+    fn twins(&self, pose: &Transform) -> Vec<(Transform, f64)> {
+        let known = self.query.symmetry();
+        let weight = self.query.landmark.covariance.try_inverse().unwrap_or_default();
+        let misfit = |p: &Transform| {
+            let seen = p.rotation * self.landmark + p.translation.vector;
+            let residual = self.query.landmark.position.coords - seen;
+            (residual.transpose() * weight * residual).x
+        };
+        let stands = |p: &Transform| {
+            let up = self.query.up.map_or(0.0, |up| (p.rotation * Vector3::z()).dot(&up));
+            self.query.standing != Some(true) || up > 0.0
+        };
+        self.query
+            .near_symmetries()
+            .into_iter()
+            .map(|s| Transform::from_parts(pose.translation, pose.rotation * s))
+            .filter(|p| known.angle_between(&p.rotation, &pose.rotation) > self.config.different)
+            .filter(stands)
+            .map(|p| (p, (0.5 * (misfit(pose) - misfit(&p))).exp()))
+            .collect()
     }
 
     /// The best pose with its belief against the different ones, or a refusal.
@@ -194,16 +252,24 @@ impl Search<'_> {
             return Err(Refusal::NoAttitude);
         };
         let odds = |e: &Explained| (e.evidence - explained.evidence).exp();
-        let total = 1.0 + others.iter().map(|o| odds(&o.1)).sum::<f64>();
+        let twins = self.twins(&best.pose);
+        let total = 1.0
+            + others.iter().map(|o| odds(&o.1)).sum::<f64>()
+            + twins.iter().map(|(_, odds)| odds).sum::<f64>();
+        let others = others.iter().map(|o| (o.0.pose, odds(&o.1)));
+        let mut alternatives: Vec<Alternative> = twins
+            .iter()
+            .copied()
+            .chain(others)
+            .map(|(pose, odds)| Alternative { pose, confidence: odds / total })
+            .collect();
+        alternatives.sort_by(|a, b| b.confidence.total_cmp(&a.confidence));
+        alternatives.truncate(MOST_ALTERNATIVES);
         let found = ObjectPose {
             pose: GaussianPose { pose: best.pose, covariance: best.covariance },
             confidence: 1.0 / total,
             coverage: explained.coverage,
-            alternatives: others
-                .iter()
-                .map(|o| Alternative { pose: o.0.pose, confidence: odds(&o.1) / total })
-                .take(4)
-                .collect(),
+            alternatives,
             symmetry: self.query.symmetry(),
         };
         if found.coverage < self.config.least_coverage {
@@ -213,102 +279,5 @@ impl Search<'_> {
             return Err(Refusal::Ambiguous { best: Box::new(found) });
         }
         Ok(found)
-    }
-}
-
-/// DIAG
-pub fn diagnose(views: &[View], query: &Query, config: &Config, truth: &Transform) {
-    let (landmark, normal) = check(views, query).unwrap();
-    let model = Model::new(query.record);
-    let sights = prepare(views, query, landmark, config);
-    let search = Search { sights: &sights, model: &model, query, landmark, normal, config };
-    let show = |name: &str, start: &Transform| {
-        let (r, e) = search.refine_and_weigh(start);
-        let d = vergence_geometry::gaussian::difference(truth, &r.pose);
-        println!(
-            "{name}: rot {:.2} deg pos {:.2} mm  ({:.2},{:.2},{:.2}) evidence {:.1} cov {:.2} scatter {:.2} own {:?} size {:.4} strain {:.1} sd {:.2}mm",
-            d.fixed_rows::<3>(0).norm().to_degrees(),
-            1e3 * d.fixed_rows::<3>(3).norm(),
-            1e3 * d[3],
-            1e3 * d[4],
-            1e3 * d[5],
-            e.evidence,
-            e.coverage,
-            e.scatter_px,
-            r.nuisances.iter().map(|n| (n.0.z * 100.0).round() / 100.0).collect::<Vec<_>>(),
-            r.log_size,
-            r.strain,
-            1e3 * (r.covariance[(3, 3)] + r.covariance[(4, 4)] + r.covariance[(5, 5)]).sqrt()
-        );
-        r
-    };
-    for (i, s) in sights.iter().enumerate() {
-        println!(
-            "view {i} scale {} {}x{} noise {:.2}",
-            s.coarse.scale,
-            s.coarse.width(),
-            s.coarse.height(),
-            s.coarse.noise
-        );
-    }
-    let r = show("from truth", truth);
-    // residuals at truth
-    let layout = Layout { spacing_px: 1.5, range_px: 4.0 };
-    for (v, s) in sights.iter().enumerate() {
-        let mut out = Vec::new();
-        let level = s.fine.as_ref().unwrap_or(&s.coarse);
-        sites::sites(
-            &mut out,
-            s,
-            v,
-            level,
-            &model,
-            &sites::State { pose: truth, log_size: 0.0, nuisance: Default::default() },
-            query.up,
-            &layout,
-        );
-
-        let mut by: std::collections::BTreeMap<usize, Vec<f64>> = Default::default();
-        let mut all = Vec::new();
-        for site in &out {
-            let sign = 1.0;
-            if let Some(n) = site
-                .edges()
-                .iter()
-                .map(|c| c.offset * sign)
-                .min_by(|a, b| a.abs().total_cmp(&b.abs()))
-            {
-                if n.abs() < 1.5 {
-                    by.entry(site.segment).or_default().push(n);
-                    if site.kind == crate::Kind::Silhouette && !site.contact {
-                        all.push(n);
-                    }
-                }
-            }
-        }
-        all.sort_by(f64::total_cmp);
-        println!(
-            "view {v}: sites {} silhouette median outward {:.3} iqr {:.3}",
-            out.len(),
-            all.get(all.len() / 2).unwrap_or(&f64::NAN),
-            all.get(all.len() * 3 / 4).unwrap_or(&f64::NAN)
-                - all.get(all.len() / 4).unwrap_or(&f64::NAN)
-        );
-        if by.len() < 12 {
-            for (k, mut v) in by {
-                v.sort_by(f64::total_cmp);
-                let kind = out.iter().find(|s| s.segment == k).map(|s| s.kind);
-                let c = out.iter().any(|s| s.segment == k && s.contact);
-                print!("  seg {k} {kind:?} {c} n {} med {:.2};", v.len(), v[v.len() / 2]);
-            }
-            println!();
-        }
-    }
-    let _ = r;
-    let hypotheses = search.hypotheses();
-    for h in &hypotheses {
-        let d = vergence_geometry::gaussian::difference(truth, &h.pose);
-        print!("[start {:.1} deg ev {:.0}] ", d.fixed_rows::<3>(0).norm().to_degrees(), h.evidence);
-        show("  hyp", &h.pose);
     }
 }

@@ -25,6 +25,9 @@ pub enum Kind {
     Silhouette,
     /// An edge between two visible faces of the object; its contrast may be poor.
     Crease,
+    /// The open rim of a cup: a lip of unknown thickness, of which the outer or the inner edge may be
+    /// the one that shows.
+    Rim,
 }
 
 /// A straight piece of visible contour, object frame (m).
@@ -44,6 +47,38 @@ pub struct Segment {
 /// The visible contour: reused between calls so that the search does not allocate.
 pub type Contour = Vec<Segment>;
 
+/// The visible contour as lines between shared points: what the search projects, each point once.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Outline {
+    /// End points, object frame (m).
+    pub points: Vec<Vector3<f64>>,
+    /// Lines between them.
+    pub lines: Vec<Line>,
+}
+
+/// A line of an [`Outline`].
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Line {
+    /// Its ends.
+    pub ends: [u16; 2],
+    /// What it is.
+    pub kind: Kind,
+    /// As in [`Segment`].
+    pub away: Option<Vector3<f64>>,
+}
+
+impl Outline {
+    fn clear(&mut self) {
+        self.points.clear();
+        self.lines.clear();
+    }
+}
+
+/// Chords of a whole circle: true to a thousandth of the radius.
+const FINE_CHORDS: usize = 72;
+/// Chords of a whole circle in the search.
+const COARSE_CHORDS: usize = 16;
+
 /// An object's form.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Model {
@@ -61,11 +96,14 @@ impl Model {
         match &record.shape {
             Shape::Box => Self::bounding_box(record),
             Shape::Cylinder { diameter, height } => {
-                Model::Frustum(Frustum::new(diameter / 2.0, diameter / 2.0, *height))
+                Model::Frustum(Frustum::new(diameter / 2.0, diameter / 2.0, *height, false))
             }
-            Shape::Cup { top_diameter, bottom_diameter, height } => {
-                Model::Frustum(Frustum::new(top_diameter / 2.0, bottom_diameter / 2.0, *height))
-            }
+            Shape::Cup { top_diameter, bottom_diameter, height } => Model::Frustum(Frustum::new(
+                top_diameter / 2.0,
+                bottom_diameter / 2.0,
+                *height,
+                true,
+            )),
             Shape::Sphere { diameter } => Model::Sphere(diameter / 2.0),
             Shape::Prism { outline, height } => {
                 Model::Polyhedron(Polyhedron::prism(outline, *height))
@@ -85,13 +123,26 @@ impl Model {
     /// `fine` asks for enough chords that a rim is true to a thousandth of its radius, else a coarse
     /// polygon is given, good for ranking.
     pub fn contour(&self, eye: &Vector3<f64>, fine: bool, out: &mut Contour) {
+        let mut outline = Outline::default();
+        self.outline(eye, fine, &mut outline);
+        let at = |k: u16| outline.points[usize::from(k)];
         out.clear();
+        out.extend(outline.lines.iter().map(|line| Segment {
+            from: at(line.ends[0]),
+            to: at(line.ends[1]),
+            kind: line.kind,
+            away: line.away,
+        }));
+    }
+
+    /// [`Model::contour`] with shared points.
+    pub(crate) fn outline(&self, eye: &Vector3<f64>, fine: bool, out: &mut Outline) {
+        out.clear();
+        let chords = if fine { FINE_CHORDS } else { COARSE_CHORDS };
         match self {
-            Model::Polyhedron(body) => body.contour(eye, out),
-            Model::Frustum(body) => body.contour(eye, if fine { 72 } else { 20 }, out),
-            Model::Sphere(radius) => {
-                revolution::sphere_outline(*radius, eye, if fine { 72 } else { 20 }, out)
-            }
+            Model::Polyhedron(body) => body.outline(eye, out),
+            Model::Frustum(body) => body.outline(eye, chords, out),
+            Model::Sphere(radius) => revolution::sphere_outline(*radius, eye, chords, out),
         }
     }
 

@@ -79,6 +79,33 @@ impl Query<'_> {
     }
 }
 
+/// Sides that differ by less than this share look alike from edges of real objects.
+const NEAR_SHARE: f64 = 0.03;
+
+impl Query<'_> {
+    /// Turns that change the object's outline by no more than objects deviate from their records.
+    pub(crate) fn near_symmetries(&self) -> Vec<UnitQuaternion<f64>> {
+        let sides = self.record.bounding_box.sides();
+        match &self.record.shape {
+            Shape::Box => {
+                let widest = sides.iter().fold(0.0, |a: f64, &b| a.max(b));
+                match Symmetry::of_box(sides, NEAR_SHARE * widest) {
+                    Symmetry::Finite(turns) => turns,
+                    _ => Vec::new(),
+                }
+            }
+            Shape::Cylinder { .. } => {
+                // Upside down about the landmark's own direction: it stays as near as it can.
+                let (x, y) = self.landmark_in_object().map_or((1.0, 0.0), |(p, _)| (p.x, p.y));
+                let axis = Unit::try_new(Vector3::new(x, y, 0.0), 1e-9);
+                let axis = axis.unwrap_or(Vector3::x_axis());
+                vec![UnitQuaternion::from_axis_angle(&axis, std::f64::consts::PI)]
+            }
+            _ => Vec::new(),
+        }
+    }
+}
+
 /// A pose that also explains the edges, less well.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Alternative {

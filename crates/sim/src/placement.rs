@@ -100,6 +100,13 @@ fn compose_once(
     for settings in &config.objects {
         objects.push(builder.place_object(settings, &mut rng)?);
     }
+    // A later object may stand before an earlier one's light: then the arrangement is drawn anew.
+    for (object, _) in objects.iter().zip(&config.objects).filter(|(_, s)| s.at.is_none()) {
+        let mut lights = object.record.landmarks.iter().map(|site| object.landmark(site));
+        if !lights.all(|light| builder.in_sight(&light)) {
+            return Err(SimError::NoPlace(object.record.object_id.to_string()));
+        }
+    }
     if config.scenario == Scenario::Occluded {
         let cup = objects.iter().position(|o| o.record.object_id.as_str() == "cup");
         if let Some(target) = cup.or(objects.len().checked_sub(1)) {

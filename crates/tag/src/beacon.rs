@@ -56,7 +56,7 @@ pub fn scan_response(object_id: &str, battery: Option<u8>, playing: bool) -> Pac
         end -= 1;
     }
     let kind = if end == object_id.len() { NAME } else { SHORT_NAME };
-    entry(&mut packet, kind, &[object_id[..end].as_bytes()]);
+    entry(&mut packet, kind, &[&object_id.as_bytes()[..end]]);
     // Version 2, not encrypted, sent at intervals.
     let head = [BTHOME[0], BTHOME[1], 0x40];
     let state = [BTHOME_BOOLEAN, u8::from(playing)];

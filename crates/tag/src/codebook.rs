@@ -177,7 +177,7 @@ fn own_distance(bits: u64, n: usize) -> u32 {
 /// zero only when both numbers are. Lengths that are no multiple of three have no such line; their
 /// strings are followed over three periods, which leaves the sum zero by itself, so they are refused.
 fn third(bits: u64, n: usize) -> (i32, i32) {
-    if n % 3 != 0 {
+    if !n.is_multiple_of(3) {
         return (1, 0);
     }
     let mut count = [0i32; 3];

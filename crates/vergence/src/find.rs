@@ -45,6 +45,8 @@ pub struct FindConfig {
     pub link_timeout: Duration,
     /// Times that a command or read is tried before the tag counts as lost.
     pub link_tries: usize,
+    /// Searches that are started when a light turned out not to be the tag's.
+    pub search_tries: usize,
     /// Seed for the choice of patterns.
     pub seed: u64,
 }
@@ -56,6 +58,7 @@ impl Default for FindConfig {
             scan_window: Duration::from_millis(1500),
             link_timeout: Duration::from_secs(2),
             link_tries: 3,
+            search_tries: 3,
             seed: 0,
         }
     }
@@ -178,15 +181,33 @@ impl Run<'_> {
         self.step("recognise", |run| run.recognise(&record, landmark, &frames, angles))
     }
 
-    /// Search, centring and triangulation, while the light blinks.
+    /// Search, centring and triangulation, while the light blinks. A light that does not obey the
+    /// challenge, or that the heads see at two places, was not the tag's: the search goes on with
+    /// the new pattern, which what misled it does not play.
     fn locate(
         &mut self,
         tag: TagAddress,
-        pattern: Pattern,
+        mut pattern: Pattern,
     ) -> Result<(GaussianPoint, [[f64; 2]; 2]), Stop> {
-        let seen = self.step("search", |run| run.search(&pattern))?;
-        let challenge = self.step("challenge", |run| run.challenge(tag, pattern))?;
-        let held = self.step("centre", |run| run.centre(&challenge, seen))?;
+        let mut tries = 1;
+        loop {
+            let seen = self.step("search", |run| run.search(&pattern))?;
+            pattern = self.step("challenge", |run| run.challenge(tag, pattern))?;
+            match self.fixate(&pattern, seen) {
+                Err(Stop::Lost(_) | Stop::Triangulation(_)) if tries < self.config.search_tries => {
+                    tries += 1;
+                }
+                outcome => return outcome,
+            }
+        }
+    }
+
+    fn fixate(
+        &mut self,
+        pattern: &Pattern,
+        seen: [search::Seen; 2],
+    ) -> Result<(GaussianPoint, [[f64; 2]; 2]), Stop> {
+        let held = self.step("centre", |run| run.centre(pattern, seen))?;
         let landmark = self.step("triangulate", |run| run.triangulate(&held))?;
         Ok((landmark, held.map(|fixation| fixation.angles)))
     }

@@ -2,6 +2,7 @@
 //! variant of [`Command`] and a line in [`run`].
 
 mod blink;
+mod evaluate;
 mod experiment;
 mod find;
 mod pose;
@@ -21,6 +22,8 @@ pub enum Command {
     Tags(tags::Tags),
     /// Run one of the paper's experiments in the simulated workcell, with statistics.
     Experiment(experiment::Experiment),
+    /// Measure how accurate and fast a part of the system is, in simulation.
+    Evaluate(evaluate::Evaluate),
     /// Write the built-in workcell to a folder, to edit and use with --config.
     Workcell(workcell::Workcell),
     /// Find blinking landmarks in a recording.
@@ -35,6 +38,7 @@ pub fn run(command: Command) -> Result<bool, Failure> {
         Command::Find(args) => find::run(&args),
         Command::Tags(args) => tags::run(&args),
         Command::Experiment(args) => experiment::run(&args),
+        Command::Evaluate(args) => evaluate::run(args),
         Command::Workcell(args) => workcell::run(&args),
         Command::Blink(args) => blink::run(args),
         Command::Pose(args) => pose::run(args),

@@ -333,6 +333,66 @@ mod tests {
         );
     }
 
+    /// What ROBOTIS' SDK sends (`scripts/check_dynamixel_sdk.py --packets`), and the manual's answer.
+    #[test]
+    fn packets_of_the_makers_sdk() {
+        use Protocol::{One, Two};
+        use instruction::*;
+        let golden: &[(Protocol, u8, u8, &[u8], &str)] = &[
+            (One, 1, ACTION, &[], "ff ff 01 02 05 f7"),
+            (One, 1, WRITE, &[0x1E, 0xD0, 0x07], "ff ff 01 05 03 1e d0 07 01"),
+            (One, 1, REG_WRITE, &[0x1E, 0x20, 0x03], "ff ff 01 05 04 1e 20 03 b4"),
+            (
+                One,
+                BROADCAST,
+                SYNC_WRITE,
+                &[0x1E, 2, 1, 0x90, 1, 2, 0xFF, 2],
+                "ff ff fe 0a 83 1e 02 01 90 01 02 ff 02 bf",
+            ),
+            (Two, 11, REBOOT, &[], "ff ff fd 00 0b 03 00 08 2f c6"),
+            (Two, BROADCAST, PING, &[], "ff ff fd 00 fe 03 00 01 31 42"),
+            (Two, 12, WRITE, &[0x40, 0, 1], "ff ff fd 00 0c 06 00 03 40 00 01 08 eb"),
+            (
+                Two,
+                BROADCAST,
+                SYNC_READ,
+                &[0x84, 0, 4, 0, 11, 12],
+                "ff ff fd 00 fe 09 00 82 84 00 04 00 0b 0c e9 46",
+            ),
+            (
+                Two,
+                BROADCAST,
+                SYNC_WRITE,
+                &[0x74, 0, 4, 0, 11, 0xDC, 5, 0, 0, 12, 0xC4, 9, 0, 0],
+                "ff ff fd 00 fe 11 00 83 74 00 04 00 0b dc 05 00 00 0c c4 09 00 00 ad 6a",
+            ),
+            (
+                Two,
+                11,
+                WRITE,
+                &[0xE0, 0, 0xFF, 0xFF, 0xFD, 0],
+                "ff ff fd 00 0b 0a 00 03 e0 00 ff ff fd fd 00 e2 7a",
+            ),
+            (
+                Two,
+                11,
+                WRITE,
+                &[0xE0, 0, 0xFF, 0xFF, 0xFD, 0xFD],
+                "ff ff fd 00 0b 0a 00 03 e0 00 ff ff fd fd fd ef f8",
+            ),
+            (Two, 1, STATUS, &[0, 6, 4, 0x26], "ff ff fd 00 01 07 00 55 00 06 04 26 65 5d"),
+        ];
+        for (protocol, id, code, parameters, hex) in golden {
+            let frame = Frame::instruction(*protocol, *id, *code, parameters);
+            let bytes: Vec<u8> =
+                hex.split(' ').map(|h| u8::from_str_radix(h, 16).unwrap()).collect();
+            assert_eq!(frame.encode(), bytes, "{hex}");
+            let mut decoder = Decoder::default();
+            decoder.push(&bytes);
+            assert_eq!(decoder.next_frame(), Some(frame), "{hex}");
+        }
+    }
+
     #[test]
     fn a_damaged_length_does_not_hide_the_next_packet() {
         let good = Frame::answer(Protocol::One, 3, 0, &[7, 8]);

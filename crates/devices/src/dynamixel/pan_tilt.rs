@@ -54,6 +54,7 @@ pub struct DynamixelPanTilt {
     clock: Arc<dyn Clock>,
     model: &'static Model,
     servos: [Servo; 2],
+    backlash: f64,
     release_on_exit: bool,
     moving: Option<Move>,
 }
@@ -129,6 +130,7 @@ impl DynamixelPanTilt {
             clock,
             model,
             servos,
+            backlash: config.backlash,
             release_on_exit: config.release_on_exit,
             moving: None,
         };
@@ -372,6 +374,10 @@ impl PanTilt for DynamixelPanTilt {
 
     fn resolution(&self) -> f64 {
         self.model.tick
+    }
+
+    fn backlash(&self) -> f64 {
+        self.backlash
     }
 }
 

@@ -14,7 +14,7 @@ use super::nuisance::{Nuisance, dot};
 use super::template::{Bank, Hypothesis, light};
 
 /// Weight of the neighbourhood's noise against the pixel's own, in frames.
-const NOISE_FRAMES: f64 = 40.0;
+const NOISE_FRAMES: f64 = 200.0;
 
 /// Widths of the amplitude priors, in noise standard deviations.
 const WIDTHS: [f64; 3] = [2.0, 8.0, 32.0];
@@ -75,9 +75,11 @@ impl Series {
         self.clear(nuisance, out);
     }
 
-    /// Energy with the prior's share added.
-    fn total(&self) -> f64 {
-        self.energy + NOISE_FRAMES * self.noise
+    /// Energy with the prior's share added. A place that stays noisier than its neighbourhood once
+    /// the best light is taken out has noise of its own.
+    fn total(&self, explained: f64) -> f64 {
+        let own = (self.energy - explained).max(0.0) / self.freedom;
+        self.energy + NOISE_FRAMES * self.noise.max(own)
     }
 }
 
@@ -133,14 +135,16 @@ pub fn weigh(series: &Series, bank: &Bank, floor: f64, scratch: &mut Vec<f32>) -
         Hypothesis { norm2: h.norm2 * f64::from(share(k)), ..h }
     };
     let correlation = f64::from(scratch[best]);
-    let bound = log_ratio(series, correlation, scaled(best).norm2);
+    let total = series.total(correlation * correlation);
+    let weigh = |c: f64, norm2: f64| log_ratio(series.freedom, total, c, norm2);
+    let bound = weigh(correlation, scaled(best).norm2);
     let evidence = Evidence { log_ratio: bound, best: scaled(best), correlation };
     if bound < floor {
         return Some(evidence);
     }
     let mut sum = 0.0;
     for (k, c) in scratch.iter().enumerate().filter(|(_, c)| **c > 0.0) {
-        sum += (log_ratio(series, f64::from(*c), scaled(k).norm2) - bound).exp();
+        sum += (weigh(f64::from(*c), scaled(k).norm2) - bound).exp();
     }
     let log_ratio = bound + (sum / bank.hypotheses.len() as f64).ln();
     Some(Evidence { log_ratio, ..evidence })
@@ -162,12 +166,12 @@ fn kept(series: &Series, bank: &Bank) -> Vec<f32> {
 }
 
 /// Log likelihood ratio of one phase and rate, amplitude and noise averaged over.
-fn log_ratio(series: &Series, correlation: f64, norm2: f64) -> f64 {
+fn log_ratio(freedom: f64, total: f64, correlation: f64, norm2: f64) -> f64 {
     if correlation <= 0.0 {
         return 0.0;
     }
-    let explained = correlation * correlation / series.total();
-    let half = 0.5 * (series.freedom + NOISE_FRAMES);
+    let explained = (correlation * correlation / total).min(0.999_999);
+    let half = 0.5 * (freedom + NOISE_FRAMES);
     let term = |width: &f64| {
         let gain = width * width * norm2;
         -0.5 * (1.0 + gain).ln() - half * (-explained * gain / (1.0 + gain)).ln_1p()

@@ -1,6 +1,6 @@
 //! What changes in the surroundings of one place: the edge of a screen, a passing shadow.
 //!
-//! Points on a ring, too far away to see the light itself, are searched for time courses that they
+//! Points on two rings, too far away to see much of the light itself, are searched for time courses that they
 //! share. A course that is stronger on the ring than at the place leaks in from outside and is
 //! projected out there; one that is weaker on the ring leaks out (the ghosts that JPEG makes of a
 //! strong light) and is left alone.
@@ -8,8 +8,9 @@
 use super::history::History;
 use super::nuisance::{Nuisance, dot, strongest};
 
-/// The ring: beyond the reach of filter and light together.
-const RING: [(i64, i64); 16] = [
+/// The rings. The outer lies beyond the reach of filter and light together; on the inner the place's
+/// own light shows with a twentieth at most, so that it cannot pass for something from outside.
+const RING: [(i64, i64); 24] = [
     (6, 0),
     (6, 3),
     (5, 5),
@@ -26,6 +27,14 @@ const RING: [(i64, i64); 16] = [
     (3, -6),
     (5, -5),
     (6, -3),
+    (3, 0),
+    (3, 3),
+    (0, 3),
+    (-3, 3),
+    (-3, 0),
+    (-3, -3),
+    (0, -3),
+    (3, -3),
 ];
 
 /// A course counts when it carries this many times the energy that noise gives one point.

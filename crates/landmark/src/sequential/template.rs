@@ -60,7 +60,15 @@ impl Bank {
     ) -> Self {
         let (period, chip) = (pattern.period().as_secs_f64(), pattern.chip.as_secs_f64());
         let between = gap(times).max(1e-4);
-        let phases = (period / (PHASE_STEP * chip.min(between).max(0.25 * chip))).ceil() as usize;
+        let mut fine = PHASE_STEP * chip.min(between).max(0.25 * chip);
+        // Where a chip lasts a whole number of frames, every change falls at the same point of an
+        // exposure: inside it, all frames are half lit, and only a step as fine as that tells.
+        let frames = chip / between;
+        if (frames - frames.round()).abs() < 0.05 * frames {
+            let exposure = times.first().map_or(0.0, |t| t.1);
+            fine = fine.min((0.5 * exposure).max(chip / 16.0));
+        }
+        let phases = (period / fine).ceil() as usize;
         let step = period / phases as f64;
         let mut bank = Bank {
             hypotheses: Vec::with_capacity(phases * rates.len()),

@@ -105,6 +105,12 @@ impl Round<'_> {
         (cells * self.requests.len() as f64 / self.config.false_alarm).ln()
     }
 
+    /// Log likelihood ratio from which a pixel is looked at closer: half of it may be lost between
+    /// pixels.
+    fn floor(&self) -> f64 {
+        0.5 * self.presence()
+    }
+
     /// Log likelihood ratio by which another explanation must be beaten.
     fn margin(&self, others: usize) -> f64 {
         (others.max(1) as f64 / self.config.wrong_identity).ln()
@@ -122,7 +128,7 @@ impl Round<'_> {
             let series = self.series_of(candidate, &raw);
             let range = candidate.request.map_or(0..self.requests.len(), |r| r..r + 1);
             for request in range {
-                let floor = self.presence() - 6.0;
+                let floor = self.floor();
                 let bank = banks.get(request);
                 let Some(evidence) = weigh(&series, bank, floor, &mut scratch) else { continue };
                 if evidence.log_ratio >= floor {
@@ -210,6 +216,15 @@ impl Round<'_> {
         let step = banks.get(request).step;
         let (mut place, mut evidence, mut series) = (seen.place, seen.evidence, seen.series);
         let (mut raw, mut expected, mut scratch) = (Vec::new(), Vec::new(), Vec::new());
+        if series.local.is_empty() {
+            let pixel = (place.x as usize, place.y as usize);
+            self.history.series_at(pixel, &mut raw);
+            let local = intruders(self.history, pixel, &raw, self.nuisance, series.noise);
+            if !local.is_empty() {
+                series = Series::new(&raw, self.nuisance, local, series.noise);
+                evidence = weigh(&series, banks.get(request), self.floor(), &mut scratch)?;
+            }
+        }
         for _ in 0..2 {
             evidence = refine(&series, pattern, &self.times, self.nuisance, evidence, step);
             let best = (evidence.best.phase, evidence.best.rate);
@@ -223,7 +238,7 @@ impl Round<'_> {
             self.history.series(place, &mut raw);
             let noise = self.noise.at(place.x as usize, place.y as usize);
             series = Series::new(&raw, self.nuisance, series.local, noise);
-            let again = weigh(&series, banks.get(request), self.presence() - 6.0, &mut scratch)?;
+            let again = weigh(&series, banks.get(request), self.floor(), &mut scratch)?;
             evidence = again;
         }
         evidence = refine(&series, pattern, &self.times, self.nuisance, evidence, step);

@@ -24,6 +24,10 @@ pub const UNIT: u16 = 16;
 pub const CAP_PX: f32 = 6.0;
 /// Price of a difference in direction (px per radian): one pixel for six degrees.
 const ANGLE_PRICE: f32 = 9.5;
+/// Angle between neighbouring directions (rad).
+const STEP: f32 = PI / DIRECTIONS as f32;
+/// Edge points of directions up to this many steps away count for a line.
+const SPREAD: usize = 4;
 
 /// The tables of one view.
 #[derive(Debug, Clone, PartialEq)]
@@ -49,8 +53,18 @@ struct Plane {
 impl Field {
     /// Builds the tables for a level of this size.
     pub fn new(edgels: &[Edgel], width: usize, height: usize) -> Self {
+        // Edge points by direction, so that each plane reads only those that can matter to it.
+        let mut bins: [Vec<Edgel>; DIRECTIONS] = std::array::from_fn(|_| Vec::new());
+        for e in edgels {
+            bins[(e.direction / STEP + 0.5) as usize % DIRECTIONS].push(*e);
+        }
+        let mut values = Vec::new();
         let planes = (0..DIRECTIONS)
-            .map(|k| Plane::new(edgels, k as f32 * PI / DIRECTIONS as f32, width, height))
+            .map(|k| {
+                let near = (k + DIRECTIONS - SPREAD)..=(k + DIRECTIONS + SPREAD);
+                let edgels = near.flat_map(|b| &bins[b % DIRECTIONS]);
+                Plane::new(edgels, k as f32 * STEP, width, height, &mut values)
+            })
             .collect();
         Field { planes }
     }
@@ -60,9 +74,10 @@ impl Field {
     /// outside the level do not count. Also the length that did count.
     pub fn evidence(&self, from: (f32, f32), to: (f32, f32)) -> (f32, f32) {
         let (dx, dy) = (to.0 - from.0, to.1 - from.1);
-        let angle = dy.atan2(dx);
-        let k = (angle * (DIRECTIONS as f32 / PI)).round() as i32;
-        let plane = &self.planes[k.rem_euclid(DIRECTIONS as i32) as usize];
+        if !(dx.is_finite() && dy.is_finite()) {
+            return (0.0, 0.0);
+        }
+        let plane = &self.planes[nearest_direction(dx, dy)];
         plane.evidence(from, to, (dx * dx + dy * dy).sqrt())
     }
 
@@ -76,36 +91,59 @@ impl Field {
     }
 }
 
+/// Index of the direction nearest to that of a vector.
+fn nearest_direction(dx: f32, dy: f32) -> usize {
+    // atan on [-1, 1] to 0.004 rad, an eighth of the error of rounding to a direction.
+    let atan = |t: f32| t * (PI / 4.0 + 0.273 * (1.0 - t.abs()));
+    let angle = match dx.abs() >= dy.abs() {
+        true if dx == 0.0 => 0.0,
+        true => atan(dy / dx),
+        false => PI / 2.0 - atan(dx / dy),
+    };
+    (angle / STEP + DIRECTIONS as f32 + 0.5) as usize % DIRECTIONS
+}
+
+/// Nearest whole number of a value above -4096.
+fn nearest(value: f32) -> i32 {
+    (value + 4096.5) as i32 - 4096
+}
+
 impl Plane {
-    fn new(edgels: &[Edgel], angle: f32, width: usize, height: usize) -> Self {
+    fn new<'a>(
+        edgels: impl Iterator<Item = &'a Edgel>,
+        angle: f32,
+        width: usize,
+        height: usize,
+        values: &mut Vec<u16>,
+    ) -> Self {
         let (sin, cos) = angle.sin_cos();
         let transposed = sin.abs() < cos.abs();
         let (rows, cols) = if transposed { (width, height) } else { (height, width) };
         let lean = if transposed { sin / cos } else { cos / sin };
         let cap = (CAP_PX * f32::from(UNIT)) as u16;
-        let mut values = vec![cap; rows * cols];
+        values.clear();
+        values.resize(rows * cols, cap);
         for e in edgels {
-            let turn = (e.direction - angle + PI / 2.0).rem_euclid(PI) - PI / 2.0;
-            let price = (turn.abs() * ANGLE_PRICE * f32::from(UNIT)) as u16;
-            if price < cap {
+            let mut turn = e.direction - angle;
+            if turn.abs() > PI / 2.0 {
+                turn -= PI.copysign(turn);
+            }
+            let price = turn.abs() * ANGLE_PRICE;
+            if price < CAP_PX {
                 let (row, col) = if transposed { (e.x, e.y) } else { (e.y, e.x) };
                 let value = &mut values[usize::from(row) * cols + usize::from(col)];
-                *value = price.min(*value);
+                *value = ((price * f32::from(UNIT)) as u16).min(*value);
             }
         }
         // Distance across the line to a column k away.
         let step = f32::from(UNIT) / (1.0 + lean * lean).sqrt();
-        let mut spare = vec![cap; cols];
-        for row in values.chunks_exact_mut(cols) {
-            for k in [1, 2, 4, 2] {
-                spread(row, &mut spare, k, (step * k as f32) as u16);
-            }
-        }
+        let prices = [1, 2, 4, 2].map(|k| (k, (step * k as f32) as u16));
+        spread(values, cols, &prices);
         let shift: Vec<i32> = (0..rows).map(|r| (r as f32 * lean).round() as i32).collect();
         let total: u64 = values.iter().map(|&v| u64::from(v)).sum();
         let mean = total as f32 / values.len().max(1) as f32;
         let mut plane = Plane { transposed, rows, cols, shift, integral: Vec::new(), mean };
-        plane.integrate(&values);
+        plane.integrate(values);
         plane
     }
 
@@ -142,14 +180,16 @@ impl Plane {
         if r0 > r1 {
             (r0, r1) = (r1, r0);
         }
-        let middle_row = (0.5 * (r0 + r1)).round().clamp(0.0, (self.rows - 1) as f32) as usize;
-        let line = (0.5 * (c0 + c1)).round() as i32 - self.shift[middle_row];
+        let last_row = self.rows as i32 - 1;
+        let middle_row = nearest(0.5 * (r0 + r1)).clamp(0, last_row) as usize;
+        let line = nearest(0.5 * (c0 + c1)) - self.shift[middle_row];
         // Whole rows that the segment covers, at least one.
-        let first = r0.round().max(0.0) as usize;
-        let last = (r1.round() - 1.0).max(first as f32).min((self.rows - 1) as f32) as usize;
-        if r1 < 0.0 || first >= self.rows || last < first {
+        let (first, end) = (nearest(r0).max(0), nearest(r1));
+        let last = (end - 1).max(first).min(last_row);
+        if end < 0 || last < first {
             return (0.0, 0.0);
         }
+        let (first, last) = (first as usize, last as usize);
         let inside =
             |r: usize| usize::try_from(line + self.shift[r]).ok().filter(|&c| c < self.cols);
         let (Some(a), Some(b)) = (inside(first), inside(last)) else { return (0.0, 0.0) };
@@ -162,20 +202,20 @@ impl Plane {
     }
 }
 
-/// `row[x] = min(row[x], row[x - k] + price, row[x + k] + price)`.
+/// `row[x] = min(row[x], row[x - k] + price, row[x + k] + price)` for every row, for each k in turn.
 #[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
-fn spread(row: &mut [u16], spare: &mut [u16], k: usize, price: u16) {
-    let n = row.len();
-    if n <= 2 * k {
-        return;
-    }
-    let spare = &mut spare[..n];
-    spare.copy_from_slice(row);
-    for (value, from) in row[k..].iter_mut().zip(&spare[..n - k]) {
-        *value = (*value).min(from + price);
-    }
-    for (value, from) in row[..n - k].iter_mut().zip(&spare[k..]) {
-        *value = (*value).min(from + price);
+fn spread(values: &mut [u16], cols: usize, prices: &[(usize, u16)]) {
+    let mut spare = vec![0u16; cols];
+    for row in values.chunks_exact_mut(cols) {
+        for &(k, price) in prices.iter().filter(|(k, _)| cols > 2 * k) {
+            spare.copy_from_slice(row);
+            for (value, from) in row[k..].iter_mut().zip(&spare[..cols - k]) {
+                *value = (*value).min(from + price);
+            }
+            for (value, from) in row[..cols - k].iter_mut().zip(&spare[k..]) {
+                *value = (*value).min(from + price);
+            }
+        }
     }
 }
 

@@ -11,7 +11,9 @@
 //! are eliminated view by view (Schur complement). The foot of a standing object, where the shadow
 //! begins, is measured only coarsely.
 
-use nalgebra::{Matrix3, Matrix6, Point3, SMatrix, SVector, Vector2, Vector3};
+use nalgebra::{
+    Matrix3, Matrix4, Matrix6, Point3, RowVector4, SMatrix, SVector, Vector2, Vector3, Vector4,
+};
 use vergence_geometry::Transform;
 use vergence_geometry::gaussian::{perturb, skew};
 
@@ -22,8 +24,10 @@ use crate::model::Kind;
 /// Standard deviation of an edge's place once the pose is right (px): aliasing, gamma, blooming and
 /// bent edges, not only noise.
 pub const EDGE_SD_PX: f64 = 0.3;
-/// Neighbouring sites err alike: contour length (px) that counts as one independent measurement.
-pub const CORRELATION_PX: f64 = 4.0;
+/// Neighbouring sites err alike: contour length that counts as one independent measurement, in the
+/// picture (px; blur and aliasing) and on the object (m; bent edges, shadows, lines of print).
+const CORRELATION_PX: f64 = 5.0;
+const CORRELATION: f64 = 0.012;
 /// Density of edges that have nothing to do with the contour (per px of normal).
 pub const STRAY_DENSITY: f64 = 0.08;
 /// Deviation of a standing object's axis from gravity (rad): tables and heads are not quite level.
@@ -34,7 +38,7 @@ const STANDING_LIMIT: f64 = 0.05;
 /// Probability that a visible contour shows no edge: occluded or without contrast.
 pub fn absence(kind: Kind) -> f64 {
     match kind {
-        Kind::Silhouette => 0.2,
+        Kind::Silhouette | Kind::Rim => 0.2,
         Kind::Crease => 0.45,
     }
 }
@@ -43,10 +47,13 @@ pub fn absence(kind: Kind) -> f64 {
 const LANDMARK_SD_PX: f64 = 0.3;
 /// Deviation of an object's true form from its record (m): rounded edges, seams, bulging sides.
 const FORM_SD: f64 = 0.0006;
+/// Thickness of the lip of an open rim (m), and its deviation.
+const LIP: f64 = 0.003;
+const LIP_SD: f64 = 0.0015;
 /// Deviation of the foot's edge (m): contact shadows hide where the object ends.
 const CONTACT_SD: f64 = 0.002;
 /// Deviation of the swelling of silhouettes (px).
-const SWELL_SD_PX: f64 = 0.3;
+const SWELL_SD_PX: f64 = 0.4;
 /// Deviation of the logarithm of the object's size: one percent.
 const SIZE_SD: f64 = 0.01;
 
@@ -54,6 +61,11 @@ const SIZE_SD: f64 = 0.01;
 pub fn deviation(site: &Site, sd_px: f64) -> f64 {
     let form = if site.contact { CONTACT_SD } else { FORM_SD };
     sd_px.hypot(form * site.px_per_metre)
+}
+
+/// How many independent measurements a site is worth.
+pub fn independent(site: &Site) -> f64 {
+    (site.length / (CORRELATION_PX + CORRELATION * site.px_per_metre)).min(1.0)
 }
 
 /// One pass of the refinement.
@@ -65,6 +77,13 @@ pub struct Pass {
     pub layout: Layout,
     /// At full resolution instead of the working scale.
     pub fine: bool,
+}
+
+impl Pass {
+    /// A pass from its numbers: deviation, range to either side, spacing of sites (picture px).
+    pub fn new(sd_px: f64, range_px: f64, spacing_px: f64, fine: bool) -> Self {
+        Pass { sd_px, layout: Layout { spacing_px, range_px }, fine }
+    }
 }
 
 /// A refined pose.
@@ -91,44 +110,35 @@ type Vector7 = SVector<f64, 7>;
 #[derive(Default, Clone)]
 struct Normal {
     shared: Matrix7,
-    mixed: SMatrix<f64, 7, 3>,
-    own: Matrix3<f64>,
+    mixed: SMatrix<f64, 7, 4>,
+    own: Matrix4<f64>,
     shared_rhs: Vector7,
-    own_rhs: Vector3<f64>,
+    own_rhs: Vector4<f64>,
 }
 
 /// Changes of the unknowns.
 #[derive(Clone)]
 struct Move {
     shared: Vector7,
-    own: Vec<Vector3<f64>>,
+    own: Vec<Vector4<f64>>,
 }
 
 impl Search<'_> {
-    /// Refines a pose through the given passes.
-    pub fn refine(&self, start: &Transform, passes: &[Pass]) -> Refined {
+    /// Refines a state through the given passes.
+    pub fn refine(&self, refined: &mut Refined, passes: &[Pass]) {
         let views = self.sights.len();
-        let mut refined = Refined {
-            pose: *start,
-            log_size: 0.0,
-            nuisances: vec![Nuisance::default(); views],
-            covariance: Matrix6::identity(),
-            strain: 0.0,
-            sites: Vec::new(),
-        };
         for pass in passes {
-            self.lay_out(&mut refined, pass);
+            self.lay_out(refined, pass);
             // Two steps on the same sites: the assignments settle while the geometry is linear.
-            let mut moved = Move { shared: Vector7::zeros(), own: vec![Vector3::zeros(); views] };
+            let mut moved = Move { shared: Vector7::zeros(), own: vec![Vector4::zeros(); views] };
             for _ in 0..2 {
-                let Some(step) = self.step(&mut refined, pass, &moved) else { break };
+                let Some(step) = self.step(refined, pass, &moved) else { break };
                 moved.shared += step.shared;
                 moved.own.iter_mut().zip(step.own).for_each(|(m, s)| *m += s);
             }
             refined.apply(&moved);
         }
-        refined.strain = self.strain(&refined);
-        refined
+        refined.strain = self.strain(refined);
     }
 
     /// Looks for the edges around a refined pose anew.
@@ -156,15 +166,20 @@ impl Search<'_> {
         let mut normals = vec![Normal::default(); self.sights.len()];
         for site in &refined.sites {
             let own = &moved.own[site.view];
-            let shift = (site.by_pose * moved.shared).x + (site.by_nuisance * own).x;
-            let Some((weight, residual)) = assign(site, shift, pass.sd_px) else { continue };
-            let n = &mut normals[site.view];
-            let (js, jo) = (site.by_pose.transpose(), site.by_nuisance.transpose());
-            n.shared += js * weight * site.by_pose;
-            n.mixed += js * weight * site.by_nuisance;
-            n.own += jo * weight * site.by_nuisance;
-            n.shared_rhs += js * (weight * residual);
-            n.own_rhs += jo * (weight * residual);
+            let by_own =
+                RowVector4::new(site.by_nuisance.x, site.by_nuisance.y, site.by_nuisance.z, 0.0);
+            let shift = (site.by_pose * moved.shared).x + (by_own * own).x;
+            let by_lip = site.by_nuisance.w;
+            for (inner, weight, residual) in assign(site, shift, by_lip * own.w, pass.sd_px) {
+                let n = &mut normals[site.view];
+                let js = site.by_pose.transpose();
+                let jo = if inner { site.by_nuisance } else { by_own };
+                n.shared += js * weight * site.by_pose;
+                n.mixed += js * weight * jo;
+                n.own += jo.transpose() * weight * jo;
+                n.shared_rhs += js * (weight * residual);
+                n.own_rhs += jo.transpose() * (weight * residual);
+            }
         }
         let mut now = refined.clone_state();
         now.apply(moved);
@@ -183,8 +198,8 @@ impl Search<'_> {
         let mut eliminated = Vec::with_capacity(normals.len());
         for (view, n) in normals.iter_mut().enumerate() {
             let precision = self.nuisance_precision(view);
-            n.own += Matrix3::from_diagonal(&precision);
-            n.own_rhs -= precision.component_mul(&now.nuisances[view].0);
+            n.own += Matrix4::from_diagonal(&precision);
+            n.own_rhs -= precision.component_mul(&(now.nuisances[view] - usual()));
             let inverse = n.own.try_inverse()?;
             a += n.shared - n.mixed * inverse * n.mixed.transpose();
             b += n.shared_rhs - n.mixed * inverse * n.own_rhs;
@@ -198,10 +213,10 @@ impl Search<'_> {
         Some(Move { shared, own })
     }
 
-    fn nuisance_precision(&self, view: usize) -> Vector3<f64> {
+    fn nuisance_precision(&self, view: usize) -> Vector4<f64> {
         // An exactly known angle still gets a nanoradian, so that one formula serves.
         let turn = self.sights[view].view.turn_sd.max(1e-9).powi(-2);
-        Vector3::new(turn, turn, SWELL_SD_PX.powi(-2))
+        Vector4::new(turn, turn, SWELL_SD_PX.powi(-2), LIP_SD.powi(-2))
     }
 
     /// Residual of the landmark (m) and its derivative by the shared unknowns.
@@ -226,14 +241,14 @@ impl Search<'_> {
         &self,
         state: &Refined,
         view: usize,
-    ) -> Option<(Vector2<f64>, SMatrix<f64, 2, 7>, SMatrix<f64, 2, 3>)> {
+    ) -> Option<(Vector2<f64>, SMatrix<f64, 2, 7>, SMatrix<f64, 2, 4>)> {
         if !self.landmark_is_pixels() {
             return None;
         }
         let sight = &self.sights[view];
         let seen = sight.optical_from_base * self.query.landmark.position;
         let seen = sight.view.camera.project(&seen)?;
-        let turn = state.nuisances[view].0;
+        let turn = state.nuisances[view];
         let turned = Transform::rotation(Vector3::new(turn.x, turn.y, 0.0));
         let optical_from_base = turned * sight.optical_from_base;
         let lever = state.pose.rotation * self.landmark * state.log_size.exp();
@@ -245,17 +260,14 @@ impl Search<'_> {
         by_shared.fixed_view_mut::<2, 3>(0, 3).copy_from(&by_base);
         by_shared.fixed_view_mut::<2, 1>(0, 6).copy_from(&(by_base * lever));
         let by_turn = by_point * -skew(&p.coords);
-        let mut by_own = SMatrix::<f64, 2, 3>::zeros();
+        let mut by_own = SMatrix::<f64, 2, 4>::zeros();
         by_own.fixed_view_mut::<2, 2>(0, 0).copy_from(&by_turn.fixed_view::<2, 2>(0, 0));
         Some((seen - pixel, by_shared, by_own))
     }
 
     /// What the landmark's measurement is worth as a point (1/m^2).
     fn landmark_weight(&self) -> Matrix3<f64> {
-        match self.landmark_is_pixels() {
-            true => Matrix3::zeros(),
-            false => self.query.landmark.covariance.try_inverse().unwrap_or_default(),
-        }
+        self.query.landmark.covariance.try_inverse().unwrap_or_default()
     }
 
     /// Information and right-hand side of the landmark, of gravity and of the size.
@@ -288,7 +300,7 @@ impl Search<'_> {
         let tilt = self.tilt(&state.pose).map_or(0.0, |t| (t.norm() / STANDING_SD).powi(2));
         let own: f64 = (0..state.nuisances.len())
             .map(|v| {
-                let n = state.nuisances[v].0;
+                let n = state.nuisances[v] - usual();
                 n.component_mul(&n).dot(&self.nuisance_precision(v))
             })
             .sum();
@@ -319,11 +331,23 @@ impl Search<'_> {
 }
 
 impl Refined {
+    /// A pose not yet refined.
+    pub fn new(pose: &Transform, views: usize) -> Self {
+        Refined {
+            pose: *pose,
+            log_size: 0.0,
+            nuisances: vec![usual(); views],
+            covariance: Matrix6::identity(),
+            strain: 0.0,
+            sites: Vec::new(),
+        }
+    }
+
     fn apply(&mut self, moved: &Move) {
         self.pose = perturb(&self.pose, &moved.shared.fixed_rows::<6>(0).into_owned());
         self.log_size += moved.shared[6];
         for (nuisance, step) in self.nuisances.iter_mut().zip(&moved.own) {
-            nuisance.0 += step;
+            *nuisance += step;
         }
     }
 
@@ -333,23 +357,39 @@ impl Refined {
     }
 }
 
-/// Weight and mean residual (px) of a site whose contour has moved by `shift`.
-fn assign(site: &Site, shift: f64, sd: f64) -> Option<(f64, f64)> {
+/// What a view's own unknowns are expected to be.
+fn usual() -> Nuisance {
+    Nuisance::new(0.0, 0.0, 0.0, LIP)
+}
+
+/// Measurements of a site whose contour has moved by `shift`, the inner edge of its lip by another
+/// `lip_shift`: for either edge whether it is the inner one, weight (1/px^2) and mean residual (px).
+fn assign(
+    site: &Site,
+    shift: f64,
+    lip_shift: f64,
+    sd: f64,
+) -> impl Iterator<Item = (bool, f64, f64)> {
     let sd = deviation(site, sd);
     let missing = absence(site.kind);
-    let density = (1.0 - missing) / (sd * (2.0 * std::f64::consts::PI).sqrt());
-    let stray = missing * STRAY_DENSITY;
-    let (mut total, mut mean) = (0.0, 0.0);
-    for c in site.edges() {
-        let r = c.offset - shift;
-        let likelihood = density * c.weight * (-0.5 * (r / sd).powi(2)).exp();
-        total += likelihood;
-        mean += likelihood * r;
+    let edges = if site.inner.is_some() { 2.0 } else { 1.0 };
+    let density = (1.0 - missing) / (edges * sd * (2.0 * std::f64::consts::PI).sqrt());
+    let mut sums = [(0.0, 0.0); 2];
+    for (place, inner) in site.places() {
+        let sum = &mut sums[usize::from(inner)];
+        let place = if inner { place + lip_shift } else { place };
+        for c in site.edges() {
+            let r = c.offset - place - shift;
+            let likelihood = density * c.weight * (-0.5 * (r / sd).powi(2)).exp();
+            sum.0 += likelihood;
+            sum.1 += likelihood * r;
+        }
     }
-    if total <= 0.0 {
-        return None;
-    }
-    let belief = total / (total + stray);
-    let weight = belief * (site.length / CORRELATION_PX).min(1.0) / (sd * sd);
-    Some((weight, mean / total))
+    let total = sums[0].0 + sums[1].0 + missing * STRAY_DENSITY;
+    let scale = independent(site) / (sd * sd * total);
+    [false, true]
+        .into_iter()
+        .zip(sums)
+        .filter(|(_, (likelihood, _))| *likelihood > 0.0)
+        .map(move |(inner, (likelihood, moment))| (inner, scale * likelihood, moment / likelihood))
 }

@@ -6,13 +6,13 @@
 //! have no contrast) on a grid of rotations, standing ones first; then the best are improved by
 //! turning them in shrinking steps.
 
-use nalgebra::{Point3, Unit, UnitQuaternion, Vector3};
+use nalgebra::{Unit, UnitQuaternion, Vector3};
 use vergence_geometry::Transform;
 
 use super::Config;
 use super::field::Field;
 use super::level::Level;
-use crate::model::{Contour, Kind, Model};
+use crate::model::{Kind, Model, Outline};
 use crate::rotations;
 use crate::types::{Query, View};
 
@@ -25,6 +25,8 @@ pub struct Sight<'a> {
     pub view: View<'a>,
     /// Base to optical frame.
     pub optical_from_base: Transform,
+    /// The lens does not distort.
+    pub straight: bool,
     /// Gradient at the working scale.
     pub coarse: Level,
     /// Gradient at full resolution, when the working scale is coarser.
@@ -58,19 +60,54 @@ pub struct Search<'a> {
     pub config: &'a Config,
 }
 
+/// Storage that the search uses over and over.
+#[derive(Default)]
+struct Scratch {
+    outline: Outline,
+    pixels: Vec<(f32, f32)>,
+}
+
+impl Sight<'_> {
+    /// Where a point of the optical frame appears on the working scale; not a number when it
+    /// is behind the camera.
+    fn place(&self, p: &Vector3<f64>) -> (f32, f32) {
+        let camera = &self.view.camera;
+        if p.z < 1e-6 {
+            return (f32::NAN, f32::NAN);
+        }
+        let inverse = 1.0 / p.z;
+        let (x, y) = (p.x * inverse, p.y * inverse);
+        let (x, y) = if self.straight { (x, y) } else { camera.distort(x, y) };
+        let (u, v) = self.coarse.from_picture(camera.fx * x + camera.cx, camera.fy * y + camera.cy);
+        (u as f32, v as f32)
+    }
+}
+
 impl Search<'_> {
     /// Different poses worth refining, best first.
     pub fn hypotheses(&self) -> Vec<Hypothesis> {
-        let mut contour = Contour::new();
+        let mut scratch = Scratch::default();
+        // One view ranks all; the others judge only what it leaves.
+        let (first, others) = self.sights.split_at(1);
         let mut found: Vec<Hypothesis> = self
             .rotations()
             .into_iter()
-            .filter_map(|turn| self.judge(turn, &mut contour))
+            .filter_map(|turn| self.judge(turn, first, &mut scratch))
             .collect();
+        if !others.is_empty() {
+            let keep = self.config.shortlist.min(found.len());
+            if keep < found.len() {
+                found.select_nth_unstable_by(keep, |a, b| b.evidence.total_cmp(&a.evidence));
+                found.truncate(keep);
+            }
+            for hypothesis in &mut found {
+                hypothesis.evidence += self.evidence(&hypothesis.pose, others, &mut scratch);
+            }
+        }
         found.sort_by(|a, b| b.evidence.total_cmp(&a.evidence));
         let mut seeds = distinct(&found, self.config.seeds, self.config.grid_spacing);
         for seed in &mut seeds {
-            self.climb(seed, &mut contour);
+            self.climb(seed, &mut scratch);
         }
         seeds.sort_by(|a, b| b.evidence.total_cmp(&a.evidence));
         distinct(&seeds, self.config.refined, 0.5 * self.config.grid_spacing)
@@ -97,7 +134,12 @@ impl Search<'_> {
     }
 
     /// The pose with the landmark in its place, unless that hides the landmark from a camera.
-    fn judge(&self, turn: UnitQuaternion<f64>, contour: &mut Contour) -> Option<Hypothesis> {
+    fn judge(
+        &self,
+        turn: UnitQuaternion<f64>,
+        sights: &[Sight],
+        scratch: &mut Scratch,
+    ) -> Option<Hypothesis> {
         let n = turn * self.normal;
         let landmark = self.query.landmark.position;
         for sight in self.sights {
@@ -108,23 +150,24 @@ impl Search<'_> {
         }
         let centre = landmark - turn * self.landmark;
         let pose = Transform::from_parts(centre.coords.into(), turn);
-        Some(Hypothesis { pose, evidence: self.evidence(&pose, contour) })
+        Some(Hypothesis { pose, evidence: self.evidence(&pose, sights, scratch) })
     }
 
-    fn evidence(&self, pose: &Transform, contour: &mut Contour) -> f32 {
+    fn evidence(&self, pose: &Transform, sights: &[Sight], scratch: &mut Scratch) -> f32 {
         let mut sum = 0.0;
-        for sight in self.sights {
+        for sight in sights {
             let optical_from_object = sight.optical_from_base * pose;
-            let eye = optical_from_object.inverse_transform_point(&Point3::origin());
-            self.model.contour(&eye.coords, false, contour);
-            for segment in contour.iter() {
-                let ends = [segment.from, segment.to].map(|p| {
-                    let p = sight.view.camera.project(&(optical_from_object * Point3::from(p)))?;
-                    let (x, y) = sight.coarse.from_picture(p.x, p.y);
-                    Some((x as f32, y as f32))
-                });
-                let [Some(from), Some(to)] = ends else { continue };
-                let weight = if segment.kind == Kind::Crease { CREASE_WEIGHT } else { 1.0 };
+            let turn = optical_from_object.rotation.to_rotation_matrix().into_inner();
+            let shift = optical_from_object.translation.vector;
+            let eye = turn.tr_mul(&-shift);
+            self.model.outline(&eye, false, &mut scratch.outline);
+            scratch.pixels.clear();
+            scratch
+                .pixels
+                .extend(scratch.outline.points.iter().map(|p| sight.place(&(turn * p + shift))));
+            for line in &scratch.outline.lines {
+                let [from, to] = line.ends.map(|k| scratch.pixels[usize::from(k)]);
+                let weight = if line.kind == Kind::Crease { CREASE_WEIGHT } else { 1.0 };
                 sum += weight * sight.field.evidence(from, to).0;
             }
         }
@@ -132,7 +175,7 @@ impl Search<'_> {
     }
 
     /// Turns a hypothesis about the landmark in shrinking steps as long as that helps.
-    fn climb(&self, hypothesis: &mut Hypothesis, contour: &mut Contour) {
+    fn climb(&self, hypothesis: &mut Hypothesis, scratch: &mut Scratch) {
         let mut step = 0.5 * self.config.grid_spacing;
         for _ in 0..self.config.climb_halvings {
             for _ in 0..3 {
@@ -141,7 +184,7 @@ impl Search<'_> {
                     for sign in [-1.0, 1.0] {
                         let turn = here.pose.rotation
                             * UnitQuaternion::from_axis_angle(&axis, sign * step);
-                        if let Some(next) = self.judge(turn, contour)
+                        if let Some(next) = self.judge(turn, self.sights, scratch)
                             && next.evidence > hypothesis.evidence
                         {
                             *hypothesis = next;

@@ -6,7 +6,7 @@
 //! and shadows to feet, so the nearest or the strongest edge is often the wrong one; the refinement
 //! weighs them all.
 
-use nalgebra::{Matrix3, Point3, RowVector3, SVector, Unit, Vector3};
+use nalgebra::{Matrix3, Point3, RowVector4, Unit, Vector3, Vector4};
 use vergence_geometry::{Transform, gaussian::skew};
 
 use super::level::Level;
@@ -34,9 +34,9 @@ pub struct Candidate {
 pub type ByPose = nalgebra::RowSVector<f64, 7>;
 
 /// What one view's measurements share: small turns of the camera about its own x and y axes (rad),
-/// and how far its silhouettes swell outwards (px; blooming, gamma, rounded edges).
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Nuisance(pub SVector<f64, 3>);
+/// how far its silhouettes swell outwards (px; blooming, gamma, rounded edges), and how thick the
+/// lip of an open rim appears (m).
+pub type Nuisance = Vector4<f64>;
 
 /// A place on the contour.
 #[derive(Debug, Clone, PartialEq)]
@@ -60,7 +60,9 @@ pub struct Site {
     /// Shift of the contour along the normal by the global unknowns (px per unit).
     pub by_pose: ByPose,
     /// The same by the view's own unknowns.
-    pub by_nuisance: RowVector3<f64>,
+    pub by_nuisance: RowVector4<f64>,
+    /// Where the inner edge of an open rim would be (px along the normal); the outer is at zero.
+    pub inner: Option<f64>,
     /// The edges, `count` of them.
     pub candidates: [Candidate; CANDIDATES],
     /// How many edges.
@@ -68,6 +70,12 @@ pub struct Site {
 }
 
 impl Site {
+    /// Places (px along the normal) where the contour's edge may be, each as likely: the contour
+    /// itself, or the inner edge of a rim's lip.
+    pub fn places(&self) -> impl Iterator<Item = (f64, bool)> {
+        std::iter::once((0.0, false)).chain(self.inner.map(|inner| (inner, true)))
+    }
+
     /// The edges found.
     pub fn edges(&self) -> &[Candidate] {
         &self.candidates[..self.count]
@@ -107,8 +115,8 @@ pub fn sites(
 ) {
     let pose = state.pose;
     let size = state.log_size.exp();
-    let swell = state.nuisance.0.z;
-    let turned = Transform::rotation(Vector3::new(state.nuisance.0.x, state.nuisance.0.y, 0.0));
+    let swell = state.nuisance.z;
+    let turned = Transform::rotation(Vector3::new(state.nuisance.x, state.nuisance.y, 0.0));
     let optical_from_object = turned * sight.optical_from_base * pose;
     let optical_from_base = optical_from_object.rotation * pose.rotation.inverse();
     let optical_from_base: Matrix3<f64> = optical_from_base.to_rotation_matrix().into_inner();
@@ -163,6 +171,11 @@ pub fn sites(
             by_pose.fixed_columns_mut::<3>(3).copy_from(&by_base);
             by_pose[6] = (by_base * lever).x;
             let by_swell = if swells { 1.0 } else { 0.0 };
+            let towards_axis = -Vector3::new(in_object.x, in_object.y, 0.0);
+            let by_lip = match (segment.kind, towards_axis.try_normalize(1e-9)) {
+                (Kind::Rim, Some(inwards)) => (by_base * (pose.rotation * inwards)).x,
+                _ => 0.0,
+            };
             let mut site = Site {
                 view,
                 segment: index,
@@ -173,7 +186,8 @@ pub fn sites(
                 px_per_metre: camera.fx / p.z,
                 contact,
                 by_pose,
-                by_nuisance: RowVector3::new(by_camera.x, by_camera.y, by_swell),
+                by_nuisance: RowVector4::new(by_camera.x, by_camera.y, by_swell, by_lip),
+                inner: (segment.kind == Kind::Rim).then_some(by_lip * state.nuisance.w),
                 candidates: Default::default(),
                 count: 0,
             };

@@ -6,7 +6,7 @@
 //! measured along the very profiles, away from the contour: in print and clutter an edge in the
 //! right place proves little, on a plain table much.
 
-use super::refine::{CORRELATION_PX, absence, deviation};
+use super::refine::{absence, deviation, independent};
 use super::sites::Site;
 use crate::model::Kind;
 
@@ -41,16 +41,19 @@ pub fn weigh(sites: &[Site], range_px: f64, sd_px: f64) -> Explained {
         let missing = absence(site.kind);
         let sd_px = deviation(site, sd_px);
         let peak = 1.0 / (sd_px * (2.0 * std::f64::consts::PI).sqrt());
-        let likelihood: f64 = site
-            .edges()
-            .iter()
-            .map(|c| c.weight * peak * (-0.5 * (c.offset / sd_px).powi(2)).exp())
-            .sum();
+        let places = if site.inner.is_some() { 2.0 } else { 1.0 };
+        let (mut likelihood, mut nearest) = (0.0, f64::INFINITY);
+        for (place, _) in site.places() {
+            for c in site.edges() {
+                let r = c.offset - place;
+                likelihood += c.weight * peak / places * (-0.5 * (r / sd_px).powi(2)).exp();
+                nearest = nearest.min(r.abs());
+            }
+        }
         let ratio = missing + (1.0 - missing) * likelihood / density;
-        evidence += ratio.ln() * (site.length / CORRELATION_PX).min(1.0);
+        evidence += ratio.ln() * independent(site);
         let weight = site.length * if site.kind == Kind::Crease { 0.5 } else { 1.0 };
         length += weight;
-        let nearest = site.edges().iter().map(|c| c.offset.abs()).fold(f64::INFINITY, f64::min);
         if nearest < BELONGS * sd_px {
             covered += weight;
             squares += weight * nearest * nearest;

@@ -2,7 +2,7 @@
 
 use nalgebra::Vector3;
 
-use super::{Contour, Kind, Segment};
+use super::{Kind, Line, Outline};
 
 /// A closed body of flat faces.
 #[derive(Debug, Clone, PartialEq)]
@@ -129,13 +129,14 @@ impl Polyhedron {
         self.faces.iter().map(|f| f.normal).collect()
     }
 
-    /// Appends the visible contour.
-    pub fn contour(&self, eye: &Vector3<f64>, out: &mut Contour) {
+    /// Writes the visible contour.
+    pub(super) fn outline(&self, eye: &Vector3<f64>, out: &mut Outline) {
         // A bit a face; records have at most 26 faces of prisms, hulls at most 92.
         let mut seen = 0u128;
         for (k, face) in self.faces.iter().enumerate().take(128) {
             seen |= u128::from(face.normal.dot(eye) > face.offset) << k;
         }
+        out.points.extend_from_slice(&self.vertices);
         for edge in &self.edges {
             let [a, b] = edge.faces.map(|f| seen >> f & 1 == 1);
             if !(a || b) {
@@ -146,22 +147,23 @@ impl Polyhedron {
                 true => (Kind::Crease, None),
                 false => (Kind::Silhouette, Some(self.faces[hidden].normal)),
             };
-            let [from, to] = edge.ends.map(|v| self.vertices[v]);
-            let whole = Segment { from, to, kind, away };
+            let line = Line { ends: edge.ends.map(|v| v as u16), kind, away };
             if self.convex {
-                out.push(whole);
+                out.lines.push(line);
             } else {
-                self.visible_pieces(eye, edge, whole, out);
+                self.visible_pieces(eye, edge, line, out);
             }
         }
     }
 
-    fn visible_pieces(&self, eye: &Vector3<f64>, edge: &Edge, whole: Segment, out: &mut Contour) {
-        let at = |k: usize| whole.from.lerp(&whole.to, k as f64 / PIECES as f64);
-        for k in 0..PIECES {
-            let (from, to) = (at(k), at(k + 1));
-            if !self.hides(&((from + to) / 2.0), eye, edge) {
-                out.push(Segment { from, to, ..whole });
+    fn visible_pieces(&self, eye: &Vector3<f64>, edge: &Edge, whole: Line, out: &mut Outline) {
+        let [from, to] = edge.ends.map(|v| self.vertices[v]);
+        let first = out.points.len();
+        out.points.extend((0..=PIECES).map(|k| from.lerp(&to, k as f64 / PIECES as f64)));
+        for k in first..first + PIECES {
+            let middle = (out.points[k] + out.points[k + 1]) / 2.0;
+            if !self.hides(&middle, eye, edge) {
+                out.lines.push(Line { ends: [k as u16, k as u16 + 1], ..whole });
             }
         }
     }
@@ -196,10 +198,11 @@ impl Polyhedron {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::model::{Contour, Model};
 
     fn lengths(body: &Polyhedron, eye: Vector3<f64>, kind: Kind) -> f64 {
         let mut out = Contour::new();
-        body.contour(&eye, &mut out);
+        Model::Polyhedron(body.clone()).contour(&eye, true, &mut out);
         out.iter().filter(|s| s.kind == kind).map(|s| (s.to - s.from).norm()).sum()
     }
 
@@ -232,7 +235,7 @@ mod tests {
         assert!(!body.convex);
         let inner = |eye| {
             let mut out = Contour::new();
-            body.contour(&eye, &mut out);
+            Model::Polyhedron(body.clone()).contour(&eye, true, &mut out);
             out.iter()
                 .filter(|s| [s.from, s.to].iter().all(|p| p.x.abs() < 1e-9 && p.y.abs() < 1e-9))
                 .map(|s| (s.to - s.from).norm())

@@ -4,27 +4,28 @@ use std::f64::consts::TAU;
 
 use nalgebra::Vector3;
 
-use super::{Contour, Kind, Segment};
+use super::{Kind, Line, Outline};
 
 /// A frustum about z, centred: cylinder or cup.
 ///
 /// A cup is open at the top; seen from above its inner wall appears, but the whole outer rim stays
-/// visible as it does for a lid, and the wall's thickness is not known, so both are one model.
+/// visible as it does for a lid, so both are one model but for the kind of the rim's contour.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Frustum {
     top: f64,
     bottom: f64,
     half_height: f64,
+    open: bool,
 }
 
 impl Frustum {
-    /// Radii at the top and at the bottom, and the height (m).
-    pub fn new(top: f64, bottom: f64, height: f64) -> Self {
-        Frustum { top, bottom, half_height: height / 2.0 }
+    /// Radii at the top and at the bottom, the height (m), and whether the top is open.
+    pub fn new(top: f64, bottom: f64, height: f64, open: bool) -> Self {
+        Frustum { top, bottom, half_height: height / 2.0, open }
     }
 
-    /// Appends the visible contour with `chords` chords for a whole rim.
-    pub fn contour(&self, eye: &Vector3<f64>, chords: usize, out: &mut Contour) {
+    /// Writes the visible contour with `chords` chords for a whole rim.
+    pub(super) fn outline(&self, eye: &Vector3<f64>, chords: usize, out: &mut Outline) {
         // The wall's outward normal at azimuth t is (cos t, sin t, -slope); it faces the eye where
         // ex cos t + ey sin t > radius at the eye's own height, extrapolated along the wall.
         let slope = (self.top - self.bottom) / (2.0 * self.half_height);
@@ -39,12 +40,15 @@ impl Frustum {
         if half > 0.0 && half < TAU / 2.0 {
             for t in [towards - half, towards + half] {
                 let (sin, cos) = t.sin_cos();
-                out.push(Segment {
-                    from: Vector3::new(self.top * cos, self.top * sin, self.half_height),
-                    to: Vector3::new(self.bottom * cos, self.bottom * sin, -self.half_height),
-                    kind: Kind::Silhouette,
-                    away: None,
-                });
+                let first = out.points.len() as u16;
+                out.points.push(Vector3::new(self.top * cos, self.top * sin, self.half_height));
+                out.points.push(Vector3::new(
+                    self.bottom * cos,
+                    self.bottom * sin,
+                    -self.half_height,
+                ));
+                let ends = [first, first + 1];
+                out.lines.push(Line { ends, kind: Kind::Silhouette, away: None });
             }
         }
     }
@@ -59,16 +63,17 @@ impl Frustum {
         towards: f64,
         half: f64,
         chords: usize,
-        out: &mut Contour,
+        out: &mut Outline,
     ) {
         let outward = Vector3::new(0.0, 0.0, z.signum());
+        let open = self.open && z > 0.0;
         let near = match cap {
-            true => (Kind::Crease, None),
+            true => (if open { Kind::Rim } else { Kind::Crease }, None),
             false => (Kind::Silhouette, Some(outward)),
         };
         arc(radius, z, towards - half, 2.0 * half, near, chords, out);
         if cap {
-            let far = (Kind::Silhouette, None);
+            let far = (if open { Kind::Rim } else { Kind::Silhouette }, None);
             arc(radius, z, towards + half, TAU - 2.0 * half, far, chords, out);
         }
     }
@@ -81,7 +86,7 @@ fn arc(
     length: f64,
     (kind, away): (Kind, Option<Vector3<f64>>),
     chords: usize,
-    out: &mut Contour,
+    out: &mut Outline,
 ) {
     let n = (length / TAU * chords as f64).ceil() as usize;
     if n == 0 || length < 1e-9 {
@@ -92,14 +97,16 @@ fn arc(
     let r = radius * 2.0 / (1.0 + (length / (2.0 * n as f64)).cos());
     let mut p = Vector3::new(r * start.cos(), r * start.sin(), z);
     for _ in 0..n {
-        let next = Vector3::new(p.x * cos - p.y * sin, p.x * sin + p.y * cos, z);
-        out.push(Segment { from: p, to: next, kind, away });
-        p = next;
+        let first = out.points.len() as u16;
+        out.points.push(p);
+        out.lines.push(Line { ends: [first, first + 1], kind, away });
+        p = Vector3::new(p.x * cos - p.y * sin, p.x * sin + p.y * cos, z);
     }
+    out.points.push(p);
 }
 
-/// Appends the outline of a ball: the circle where the lines of sight touch it.
-pub fn sphere_outline(radius: f64, eye: &Vector3<f64>, chords: usize, out: &mut Contour) {
+/// Writes the outline of a ball: the circle where the lines of sight touch it.
+pub(super) fn sphere_outline(radius: f64, eye: &Vector3<f64>, chords: usize, out: &mut Outline) {
     let distance = eye.norm();
     if distance <= radius {
         return;
@@ -114,21 +121,24 @@ pub fn sphere_outline(radius: f64, eye: &Vector3<f64>, chords: usize, out: &mut 
         let (sin, cos) = (TAU * k as f64 / chords as f64).sin_cos();
         axis * height + (u * cos + v * sin) * r
     };
-    for k in 0..chords {
-        out.push(Segment { from: at(k), to: at(k + 1), kind: Kind::Silhouette, away: None });
+    out.points.extend((0..chords).map(at));
+    for k in 0..chords as u16 {
+        let ends = [k, (k + 1) % chords as u16];
+        out.lines.push(Line { ends, kind: Kind::Silhouette, away: None });
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::model::{Contour, Model};
 
     #[test]
     fn limbs_touch_the_line_of_sight() {
-        let cup = Frustum::new(0.05, 0.03, 0.1);
+        let cup = Frustum::new(0.05, 0.03, 0.1, true);
         let eye = Vector3::new(0.4, -0.3, 0.25);
         let mut out = Contour::new();
-        cup.contour(&eye, 72, &mut out);
+        Model::Frustum(cup).contour(&eye, true, &mut out);
         let limbs: Vec<_> = out.iter().filter(|s| (s.from.z - s.to.z).abs() > 0.05).collect();
         assert_eq!(limbs.len(), 2);
         for limb in limbs {
@@ -142,9 +152,9 @@ mod tests {
 
     #[test]
     fn a_lid_shows_its_whole_rim_and_half_of_the_foot() {
-        let can = Frustum::new(0.04, 0.04, 0.1);
+        let can = Frustum::new(0.04, 0.04, 0.1, false);
         let mut out = Contour::new();
-        can.contour(&Vector3::new(10.0, 0.0, 10.0), 72, &mut out);
+        Model::Frustum(can).contour(&Vector3::new(10.0, 0.0, 10.0), true, &mut out);
         let length = |z: f64| {
             out.iter()
                 .filter(|s| s.from.z == z && s.to.z == z)
@@ -159,7 +169,7 @@ mod tests {
     fn a_ball_is_touched_by_every_line_of_sight() {
         let eye = Vector3::new(0.3, 0.5, -0.2);
         let mut out = Contour::new();
-        sphere_outline(0.05, &eye, 24, &mut out);
+        Model::Sphere(0.05).contour(&eye, true, &mut out);
         for s in &out {
             assert!((s.from.norm() - 0.05).abs() < 1e-12);
             assert!(s.from.dot(&(eye - s.from)).abs() < 1e-12);

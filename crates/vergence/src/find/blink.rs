@@ -42,7 +42,8 @@ impl Run<'_> {
         if self.config.method == Method::Paper {
             return Ok(played);
         }
-        let drawn = codebook::challenge(self.config.seed, played.chip, &[played.bits]);
+        let seed = self.config.seed.wrapping_add(played.bits.raw());
+        let drawn = codebook::challenge(seed, played.chip, &[played.bits]);
         let pattern = drawn.unwrap_or(played);
         self.command(tag, LedCommand::Play(pattern))?;
         Ok(pattern)

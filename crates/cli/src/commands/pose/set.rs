@@ -34,6 +34,7 @@ struct Picture {
     image: Image<u8>,
     camera: Camera,
     base_from_optical: Transform,
+    turn_sd: f64,
 }
 
 #[derive(Deserialize)]
@@ -47,6 +48,9 @@ struct CameraEntry {
     cam_dist: Option<[f64; 5]>,
     /// A camera that pans and tilts stands on a robot, whose base is level.
     pan: Option<f64>,
+    /// How well the camera's angles are known (rad); exactly when absent.
+    #[serde(default)]
+    turn_sd: f64,
 }
 
 #[derive(Deserialize)]
@@ -109,7 +113,7 @@ impl Scene {
                 image: &p.image,
                 camera: p.camera,
                 base_from_optical: p.base_from_optical,
-                turn_sd: 0.0,
+                turn_sd: p.turn_sd,
             })
             .collect()
     }
@@ -152,7 +156,8 @@ impl Picture {
         let base_from_optical = optical_from_base(&entry)
             .ok_or_else(|| bad(&path, "cam_R_w2c is not a rotation, or cam_t_w2c not finite"))?;
         let base_from_optical = base_from_optical.inverse();
-        Ok((Picture { image, camera, base_from_optical }, entry.pan.is_some()))
+        let turn_sd = entry.turn_sd.abs();
+        Ok((Picture { image, camera, base_from_optical, turn_sd }, entry.pan.is_some()))
     }
 }
 

@@ -1,0 +1,302 @@
+//! The driver `mjpeg`: cameras that stream JPEG pictures over HTTP (`multipart/x-mixed-replace`), as
+//! network cameras, mjpg-streamer and single-board computers do.
+//!
+//! A thread reads the stream as fast as it comes, so that pictures never queue up in the network, and
+//! keeps the newest few; the rest are seen as gaps in [`Frame::sequence`]. It reconnects when the
+//! stream ends, breaks or falls silent. Pictures are stamped with the `X-Timestamp` header of their
+//! part when there is one: the camera's clock is brought to ours by the smallest delay seen lately.
+//! Else the arrival of the part's header is the stamp, late by the transport.
+//!
+//! Exposure is not told by such cameras; the configuration may.
+
+mod multipart;
+
+use std::collections::VecDeque;
+use std::io::{BufReader, Write};
+use std::net::{Shutdown, TcpStream, ToSocketAddrs};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use serde::Deserialize;
+use vergence_imaging::{Frame, codec};
+
+use crate::traits::{Camera, Clock, DeviceError};
+use multipart::{Part, StreamError};
+
+/// A stream that says nothing for so long is dead.
+const SILENCE: Duration = Duration::from_secs(2);
+const CONNECT: Duration = Duration::from_secs(2);
+/// Wait between attempts to connect.
+const RETRY: Duration = Duration::from_millis(200);
+/// Pictures kept for a reader that is busy for a moment.
+const KEPT: usize = 4;
+/// Pictures over which the smallest delay is sought: ten seconds at 30 a second.
+const DELAY_WINDOW: usize = 300;
+
+/// Settings of one such camera.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MjpegConfig {
+    /// Address, `http://host[:port]/path`.
+    pub url: String,
+    /// Exposure time (s), when known.
+    #[serde(default)]
+    pub exposure: f64,
+}
+
+/// A camera behind HTTP.
+pub struct MjpegCamera {
+    url: String,
+    size: (usize, usize),
+    exposure: Duration,
+    shared: Arc<Shared>,
+    thread: Option<JoinHandle<()>>,
+}
+
+#[derive(Default)]
+struct Shared {
+    state: Mutex<State>,
+    news: Condvar,
+}
+
+#[derive(Default)]
+struct State {
+    pictures: VecDeque<Picture>,
+    /// To end a read that blocks.
+    stream: Option<TcpStream>,
+    /// Why there is no connection now.
+    trouble: Option<String>,
+    stop: bool,
+}
+
+struct Picture {
+    jpeg: Vec<u8>,
+    stamp: Duration,
+    sequence: u64,
+}
+
+impl MjpegCamera {
+    /// Connects to a camera that delivers pictures of this size, or fails when it does not answer.
+    pub fn open(
+        config: &MjpegConfig,
+        size: (usize, usize),
+        clock: Arc<dyn Clock>,
+    ) -> Result<Self, DeviceError> {
+        let unsupported =
+            |what: String| DeviceError::Unsupported { device: config.url.clone(), what };
+        let target = Target::parse(&config.url)
+            .ok_or_else(|| unsupported("the address is not http://host[:port]/path".into()))?;
+        if !(config.exposure.is_finite() && (0.0..10.0).contains(&config.exposure)) {
+            return Err(unsupported(format!(
+                "exposure {} s is not between 0 and 10 s",
+                config.exposure
+            )));
+        }
+        let shared = Arc::new(Shared::default());
+        let first = target.connect(&shared).map_err(|e| DeviceError::Disconnected {
+            device: config.url.clone(),
+            reason: e.to_string(),
+        })?;
+        let reader =
+            Reader { target, shared: shared.clone(), clock, sequence: 0, delays: VecDeque::new() };
+        let thread = std::thread::spawn(move || reader.run(first));
+        Ok(MjpegCamera {
+            url: config.url.clone(),
+            size,
+            exposure: Duration::from_secs_f64(config.exposure),
+            shared,
+            thread: Some(thread),
+        })
+    }
+}
+
+impl Camera for MjpegCamera {
+    fn next_frame(&mut self, timeout: Duration) -> Result<Frame, DeviceError> {
+        let device = || self.url.clone();
+        let deadline = Instant::now() + timeout;
+        let mut state = self.shared.lock();
+        let picture = loop {
+            if let Some(picture) = state.pictures.pop_front() {
+                break picture;
+            }
+            let left = deadline.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return Err(match state.trouble.clone() {
+                    Some(reason) => DeviceError::Disconnected { device: device(), reason },
+                    None => DeviceError::Timeout { device: device(), timeout },
+                });
+            }
+            let waited = self.shared.news.wait_timeout(state, left);
+            state = waited.unwrap_or_else(PoisonError::into_inner).0;
+        };
+        drop(state);
+        let image = codec::decode(&picture.jpeg)
+            .map_err(|e| DeviceError::Fault { device: device(), fault: e.to_string() })?;
+        if (image.width(), image.height()) != self.size {
+            let (width, height) = self.size;
+            return Err(DeviceError::Unsupported {
+                device: device(),
+                what: format!(
+                    "pictures are {}x{}, the configuration says {width}x{height}",
+                    image.width(),
+                    image.height()
+                ),
+            });
+        }
+        Ok(Frame {
+            image,
+            stamp: picture.stamp,
+            exposure: self.exposure,
+            row_time: None,
+            sequence: picture.sequence,
+        })
+    }
+}
+
+impl Drop for MjpegCamera {
+    fn drop(&mut self) {
+        let mut state = self.shared.lock();
+        state.stop = true;
+        if let Some(stream) = state.stream.take() {
+            // It may have ended by itself.
+            let _ = stream.shutdown(Shutdown::Both);
+        }
+        drop(state);
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+impl Shared {
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Host and path of an address.
+struct Target {
+    host: String,
+    path: String,
+}
+
+impl Target {
+    fn parse(url: &str) -> Option<Target> {
+        let rest = url.strip_prefix("http://")?;
+        let (host, path) = rest.split_once('/').unwrap_or((rest, ""));
+        let clean = |s: &str| !s.chars().any(|c| c.is_control() || c == ' ');
+        if host.is_empty() || !clean(host) || !clean(path) {
+            return None;
+        }
+        let host = if host.contains(':') { host.into() } else { format!("{host}:80") };
+        Some(Target { host, path: format!("/{path}") })
+    }
+
+    /// Connects and asks; the answer is still to be read. HTTP 1.0, so that nothing comes in chunks.
+    fn connect(&self, shared: &Shared) -> std::io::Result<TcpStream> {
+        let mut last = std::io::Error::from(std::io::ErrorKind::NotFound);
+        for address in self.host.to_socket_addrs()? {
+            match TcpStream::connect_timeout(&address, CONNECT) {
+                Ok(mut stream) => {
+                    stream.set_read_timeout(Some(SILENCE))?;
+                    stream.set_write_timeout(Some(CONNECT))?;
+                    let request =
+                        format!("GET {} HTTP/1.0\r\nHost: {}\r\n\r\n", self.path, self.host);
+                    stream.write_all(request.as_bytes())?;
+                    shared.lock().stream = Some(stream.try_clone()?);
+                    return Ok(stream);
+                }
+                Err(e) => last = e,
+            }
+        }
+        Err(last)
+    }
+}
+
+/// The thread's side.
+struct Reader {
+    target: Target,
+    shared: Arc<Shared>,
+    clock: Arc<dyn Clock>,
+    sequence: u64,
+    /// Arrival minus the camera's stamp (s) of the last pictures.
+    delays: VecDeque<f64>,
+}
+
+impl Reader {
+    fn run(mut self, first: TcpStream) {
+        let mut stream = Some(first);
+        while !self.shared.lock().stop {
+            let trouble = match stream.take() {
+                Some(stream) => self.read(stream).to_string(),
+                None => match self.target.connect(&self.shared) {
+                    Ok(fresh) => {
+                        stream = Some(fresh);
+                        continue;
+                    }
+                    Err(e) => e.to_string(),
+                },
+            };
+            let mut state = self.shared.lock();
+            if state.stop {
+                break;
+            }
+            state.trouble = Some(trouble);
+            drop(state);
+            std::thread::sleep(RETRY);
+        }
+    }
+
+    /// Reads pictures until the stream fails; gives the reason.
+    fn read(&mut self, stream: TcpStream) -> StreamError {
+        // Another connection may be another run of the camera, with another clock.
+        self.delays.clear();
+        let mut parts = match multipart::Parts::open(BufReader::new(stream)) {
+            Ok(parts) => parts,
+            Err(e) => return e,
+        };
+        loop {
+            let clock = self.clock.clone();
+            match parts.next_part(|| clock.now()) {
+                Ok(part) => self.deliver(part),
+                Err(e) => return e,
+            }
+            if self.shared.lock().stop {
+                return StreamError::Ended;
+            }
+        }
+    }
+
+    fn deliver(&mut self, part: Part<Duration>) {
+        let stamp = self.stamp(part.arrival, part.timestamp);
+        let picture = Picture { jpeg: part.body, stamp, sequence: self.sequence };
+        self.sequence += 1;
+        let mut state = self.shared.lock();
+        state.trouble = None;
+        state.pictures.push_back(picture);
+        if state.pictures.len() > KEPT {
+            state.pictures.pop_front();
+        }
+        self.shared.news.notify_all();
+    }
+
+    /// The capture time on our clock.
+    fn stamp(&mut self, arrival: Duration, camera: Option<f64>) -> Duration {
+        let Some(camera) = camera else { return arrival };
+        let delay = arrival.as_secs_f64() - camera;
+        // A clock that jumps has nothing to do with the delays before.
+        if self.delays.back().is_some_and(|last| (delay - last).abs() > 1.0) {
+            self.delays.clear();
+        }
+        self.delays.push_back(delay);
+        if self.delays.len() > DELAY_WINDOW {
+            self.delays.pop_front();
+        }
+        let least = self.delays.iter().copied().fold(f64::INFINITY, f64::min);
+        Duration::try_from_secs_f64(camera + least).unwrap_or(arrival)
+    }
+}
+
+#[cfg(test)]
+mod tests;

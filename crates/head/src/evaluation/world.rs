@@ -1,0 +1,327 @@
+//! The simulated truth behind the figures: a head that differs from its description, its servos, and
+//! what is seen.
+
+use nalgebra::{Matrix2, Point2, Point3, Vector2, Vector3};
+use rand::RngExt;
+use rand_pcg::Pcg64Mcg;
+use vergence_geometry::{Camera, Chain, Joint, Limits, Ray, Transform, optical_from_body};
+
+use crate::calibration::{
+    Calibration, HEAD_UNKNOWNS, HeadVector, KnownLength, LightPlace, apply, middle,
+};
+use crate::triangulation::nearest_to_rays;
+use crate::{
+    Fixation, Fixator, FixatorConfig, NextMove, Noise, PanTiltHead, dither, triangulate_many,
+};
+
+use super::{EvaluationConfig, LightSource, ServoKind, Sums};
+
+/// A true head and what is believed of it.
+pub(super) struct World {
+    truth: [PanTiltHead; 2],
+    pub(super) nominal: [PanTiltHead; 2],
+    kind: ServoKind,
+    pixel_sigma: f64,
+}
+
+/// What a calibration is given, and where its lights really are.
+#[derive(Default)]
+pub(super) struct Session {
+    lights: Vec<Point3<f64>>,
+    pub(super) places: Vec<LightPlace>,
+    pub(super) lengths: Vec<KnownLength>,
+}
+
+/// One servo pair: told angles, true angles.
+struct Servos {
+    told: [f64; 2],
+    shaft: [f64; 2],
+}
+
+impl World {
+    pub(super) fn draw(
+        kind: &ServoKind,
+        config: &EvaluationConfig,
+        random: &mut Pcg64Mcg,
+    ) -> World {
+        let nominal = described_heads(config.baseline);
+        let truth = [0, 1].map(|k| {
+            let mut change = HeadVector::zeros();
+            for i in 0..HEAD_UNKNOWNS {
+                let bound = match i {
+                    0..18 if i % 6 < 3 => 3f64.to_radians(),
+                    0..18 => 0.010,
+                    18 => 0.10,
+                    19 | 20 => 5.0,
+                    _ => 0.05,
+                };
+                change[i] = random.random_range(-bound..bound);
+            }
+            apply(&nominal[k], &change)
+        });
+        World { truth, nominal, kind: *kind, pixel_sigma: config.pixel_sigma }
+    }
+
+    /// A light this far from the middle of the true head, within easy reach.
+    pub(super) fn new_light(&self, distance: f64, random: &mut Pcg64Mcg) -> Point3<f64> {
+        let pan: f64 = random.random_range(-0.5..0.5);
+        let tilt: f64 = random.random_range(-0.1..0.6);
+        let direction = Vector3::new(tilt.cos() * pan.cos(), tilt.cos() * pan.sin(), -tilt.sin());
+        middle(&self.truth) + direction * distance
+    }
+
+    /// What the calibration is given: the light at some places, seen by each head from angles that
+    /// bring it all over the picture. The places are known from the arm, or pairs of them are a ruler's
+    /// length apart.
+    pub(super) fn session(&self, config: &EvaluationConfig, random: &mut Pcg64Mcg) -> Session {
+        const ARM: f64 = 0.0005;
+        const RULER: (f64, f64) = (0.5, 0.0003);
+        let mut session = Session::default();
+        for pair in 0..config.places.div_ceil(2) {
+            let distance = random.random_range(0.6..1.5);
+            let first = self.new_light(distance, random);
+            // Along a table's edge: sideways and a little to the back.
+            let turn: f64 = random.random_range(-0.7..0.7);
+            let second = first + Vector3::new(turn.sin(), turn.cos(), 0.0) * RULER.0;
+            let length = RULER.0 + RULER.1 * normal(random);
+            if config.light == LightSource::Ruler {
+                session.lengths.push(KnownLength {
+                    places: [2 * pair, 2 * pair + 1],
+                    length,
+                    sigma: RULER.1,
+                });
+            }
+            for light in [first, second] {
+                let fixations =
+                    [0, 1].map(|k| self.look_around(k, &light, config.views, [0.35, 0.25], random));
+                let known = (config.light == LightSource::Arm).then(|| {
+                    let shake = Vector3::from_fn(|_, _| normal(random)) * ARM;
+                    (light + shake, ARM)
+                });
+                session.places.push(LightPlace { fixations, known });
+                session.lights.push(light);
+            }
+        }
+        session
+    }
+
+    /// Sightings of a light from angles spread evenly within `reach` of looking at it.
+    fn look_around(
+        &self,
+        k: usize,
+        light: &Point3<f64>,
+        views: usize,
+        reach: [f64; 2],
+        random: &mut Pcg64Mcg,
+    ) -> Vec<Fixation> {
+        let centre = self.truth[k].aim_at(light);
+        let mut servos = Servos::at(centre);
+        (0..views)
+            .filter_map(|_| {
+                let goal = [0, 1].map(|j| centre[j] + reach[j] * random.random_range(-1.0..1.0));
+                servos.arrive(self.truth[k].clamp(goal), &self.kind, random);
+                self.sight(k, light, &servos, random)
+            })
+            .collect()
+    }
+
+    /// What is seen of a light where the servos stand: told angles, noisy pixel.
+    fn sight(
+        &self,
+        k: usize,
+        light: &Point3<f64>,
+        servos: &Servos,
+        random: &mut Pcg64Mcg,
+    ) -> Option<Fixation> {
+        let pixel = self.truth[k].project(servos.shaft, light)?;
+        if !self.truth[k].camera.contains(&pixel, 4.0) {
+            return None;
+        }
+        let shake = Vector2::new(normal(random), normal(random)) * self.pixel_sigma;
+        Some(Fixation {
+            angles: servos.told,
+            pixel: pixel + shake,
+            pixel_covariance: Matrix2::identity() * self.pixel_sigma.powi(2),
+        })
+    }
+
+    /// Fixates a light as the robot would, then re-aims around it.
+    fn fixate(
+        &self,
+        k: usize,
+        believed: &PanTiltHead,
+        light: &Point3<f64>,
+        aims: usize,
+        random: &mut Pcg64Mcg,
+    ) -> Vec<Fixation> {
+        let mut start = self.truth[k].aim_at(light);
+        start =
+            [start[0] + random.random_range(-0.2..0.2), start[1] + random.random_range(-0.2..0.2)];
+        let mut servos = Servos::at(self.truth[k].clamp(start));
+        servos.arrive(servos.told, &self.kind, random);
+        let mut fixator = Fixator::new(FixatorConfig {
+            resolution: self.kind.step,
+            backlash: self.kind.backlash,
+            ..FixatorConfig::default()
+        });
+        while let Some(seen) = self.sight(k, light, &servos, random) {
+            match fixator.next(believed, servos.told, &seen.pixel, None) {
+                NextMove::Hold => break,
+                NextMove::Go { via, goal } => {
+                    via.into_iter().for_each(|v| servos.go(v, &self.kind, random));
+                    servos.go(goal, &self.kind, random);
+                }
+            }
+        }
+        // Far enough apart that every aim falls into another part of a step.
+        let reach = 6.0 * self.kind.step;
+        dither(servos.told, reach, aims)
+            .into_iter()
+            .filter_map(|goal| {
+                servos.arrive(goal, &self.kind, random);
+                self.sight(k, light, &servos, random)
+            })
+            .collect()
+    }
+
+    /// Distances of one new light, before and after calibration.
+    pub(super) fn measure(
+        &self,
+        light: &Point3<f64>,
+        calibration: &Calibration,
+        config: &EvaluationConfig,
+        random: &mut Pcg64Mcg,
+        sums: &mut Sums,
+    ) {
+        let true_distance = (light - middle(&self.truth)).norm();
+        let raw = [0, 1].map(|k| self.fixate(k, &self.nominal[k], light, config.aims, random));
+        match self.described_distance(&raw) {
+            Some(distance) => sums.before.push(distance - true_distance),
+            None => {
+                sums.refused_before += 1;
+                sums.before.push(true_distance);
+            }
+        }
+        let heads = &calibration.heads;
+        let noise = Noise { common_sigma: 5e-4, ..Noise::of_servo(self.kind.step, 0.0) };
+        let seen = [0, 1].map(|k| self.fixate(k, &heads[k], light, config.aims, random));
+        let [left, right] = &seen;
+        let error = |left: &[Fixation], right: &[Fixation]| {
+            triangulate_many(heads, [left, right], &noise).map_or(true_distance, |l| {
+                (l.point.position - middle(heads)).norm() - true_distance
+            })
+        };
+        sums.after.push(error(left, right));
+        if let (Some(a), Some(b)) = (left.first(), right.first()) {
+            sums.single.push(error(&[*a], &[*b]));
+        }
+        self.cover(light, calibration, sums);
+    }
+
+    /// Distance by the description, from the point nearest to all rays; `None` when that is behind.
+    fn described_distance(&self, seen: &[Vec<Fixation>; 2]) -> Option<f64> {
+        let rays: Vec<Ray> = (0..2)
+            .flat_map(|k| seen[k].iter().map(move |f| (k, f)))
+            .map(|(k, f)| self.nominal[k].ray(f.angles, &f.pixel))
+            .collect();
+        let off = nearest_to_rays(&rays)? - middle(&self.nominal);
+        (off.dot(&rays[0].direction) > 0.0).then(|| off.norm())
+    }
+
+    /// Distance error of noise-free sightings against what the calibration predicts of itself.
+    fn cover(&self, light: &Point3<f64>, calibration: &Calibration, sums: &mut Sums) {
+        let slack = self.kind.backlash / 2.0;
+        let rays = [0, 1].map(|k| {
+            // The slack from one side is part of the calibrated zero: encoders tell more by half.
+            let shaft = self.truth[k].aim_at(light);
+            let told = shaft.map(|a| a + slack);
+            let pixel = self.truth[k].project(shaft, light).unwrap_or_else(Point2::origin);
+            calibration.heads[k].ray(told, &pixel)
+        });
+        let Some(point) = nearest_to_rays(&rays) else { return };
+        let error =
+            (point - middle(&calibration.heads)).norm() - (light - middle(&self.truth)).norm();
+        let Some(sigma) = calibration.distance_sigma(&point) else { return };
+        sums.covered.push(f64::from(u8::from(error.abs() <= 1.96 * sigma)));
+    }
+
+    /// Predicts sightings of the calibration's lights from new angles of all joints.
+    pub(super) fn hold_out(
+        &self,
+        session: &Session,
+        calibration: &Calibration,
+        random: &mut Pcg64Mcg,
+        sums: &mut Sums,
+    ) {
+        for (light, found) in session.lights.iter().zip(&calibration.lights) {
+            for k in 0..2 {
+                for seen in self.look_around(k, light, 4, [0.35, 0.25], random) {
+                    let predicted = calibration.heads[k].project(seen.angles, found);
+                    let Some(predicted) = predicted else { continue };
+                    let off = predicted - seen.pixel;
+                    sums.held_out.extend([off.x, off.y]);
+                    let slack = self.kind.backlash / 2.0;
+                    let shaft = seen.angles.map(|a| a - slack);
+                    if let Some(real) = self.truth[k].project(shaft, light) {
+                        let off = predicted - real;
+                        sums.model.extend([off.x, off.y]);
+                    }
+                }
+            }
+        }
+    }
+}
+
+impl Servos {
+    fn at(angles: [f64; 2]) -> Self {
+        Servos { told: angles, shaft: angles }
+    }
+
+    /// A move: the motor rests anywhere within the step that the encoder tells, the shaft follows it
+    /// once the slack is taken up.
+    fn go(&mut self, goal: [f64; 2], kind: &ServoKind, random: &mut Pcg64Mcg) {
+        for j in 0..2 {
+            self.told[j] = (goal[j] / kind.step).round() * kind.step;
+            let motor = self.told[j] + kind.step * random.random_range(-0.5..0.5);
+            let half = kind.backlash / 2.0;
+            self.shaft[j] = self.shaft[j].clamp(motor - half, motor + half);
+        }
+    }
+
+    /// A move that ends upwards in both joints.
+    fn arrive(&mut self, goal: [f64; 2], kind: &ServoKind, random: &mut Pcg64Mcg) {
+        if kind.backlash > 0.0 {
+            self.go(goal.map(|g| g - 1.5 * kind.backlash), kind, random);
+        }
+        self.go(goal, kind, random);
+    }
+}
+
+/// The head as described: lever arms of some centimetres, 320x240 pixels, 0.5 m above base.
+pub(super) fn described_heads(baseline: f64) -> [PanTiltHead; 2] {
+    [baseline / 2.0, -baseline / 2.0].map(|y| {
+        let joint = |name: &str, origin: [f64; 3], axis, lower, upper| Joint {
+            name: name.into(),
+            parent_from_joint: Transform::translation(origin[0], origin[1], origin[2]),
+            axis,
+            limits: Limits { lower, upper, velocity: 3.6 },
+        };
+        let chain = Chain {
+            joints: vec![
+                joint("pan", [0.0, y, 0.5], Vector3::z_axis(), -1.8, 1.8),
+                joint("tilt", [0.012, 0.0, 0.04], Vector3::y_axis(), -0.8, 1.2),
+            ],
+            last_from_tip: Transform::from_parts(
+                [0.025, 0.0, 0.015].into(),
+                optical_from_body().inverse(),
+            ),
+        };
+        PanTiltHead { chain, camera: Camera::centred(320, 240, 300.0) }
+    })
+}
+
+/// A standard normal number (Box-Muller).
+fn normal(random: &mut Pcg64Mcg) -> f64 {
+    let radius = (-2.0 * random.random_range(f64::MIN_POSITIVE..1.0).ln()).sqrt();
+    radius * (std::f64::consts::TAU * random.random::<f64>()).cos()
+}
