@@ -5,11 +5,15 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use vergence::System;
 use vergence::report::{Report, TruthReport, numbers};
-use vergence_devices::{Config, Description, Side};
+use vergence_devices::{Config, Description, Robot, Side};
 use vergence_geometry::Transform;
 use vergence_sim::{Scenario, Workcell};
 
 use crate::failure::Failure;
+use crate::radio::{self, Radio};
+
+/// The radio driver for Bluetooth controllers.
+const HCI: &str = "hci";
 
 /// Which robot.
 #[derive(Args, Clone, Default)]
@@ -50,22 +54,45 @@ impl RobotArgs {
                 let (config, description) = read(path)?;
                 check_drivers(&config)?;
                 let workcell = Workcell::from_config(&config, &description, self.seed);
-                Opened::simulated(workcell.map_err(unusable)?)
+                let workcell = workcell.map_err(unusable)?;
+                let mut devices = workcell.robot();
+                if config.radio.driver == HCI {
+                    devices.radio = Box::new(radio::open(&config, folder(path))?.link);
+                }
+                Opened::new(workcell, devices)
             }
             None => Opened::embedded(self.seed, Scenario::Default),
         }
+    }
+
+    /// Opens the tag radio alone.
+    pub fn open_radio(&self) -> Result<Radio, Failure> {
+        let workcell = match &self.config {
+            Some(path) => {
+                let (config, description) = read(path)?;
+                check_drivers(&config)?;
+                if config.radio.driver == HCI {
+                    return radio::open(&config, folder(path));
+                }
+                Workcell::from_config(&config, &description, self.seed)
+            }
+            None => Workcell::embedded(self.seed),
+        };
+        Ok(Radio::simulated(&workcell.map_err(unusable)?))
     }
 }
 
 impl Opened {
     /// The embedded workcell in one of its scenarios.
     pub fn embedded(seed: u64, scenario: Scenario) -> Result<Self, Failure> {
-        Self::simulated(Workcell::embedded_as(scenario, seed).map_err(unusable)?)
+        let workcell = Workcell::embedded_as(scenario, seed).map_err(unusable)?;
+        let devices = workcell.robot();
+        Self::new(workcell, devices)
     }
 
-    fn simulated(workcell: Workcell) -> Result<Self, Failure> {
+    fn new(workcell: Workcell, devices: Robot) -> Result<Self, Failure> {
         let (config, description) = (workcell.config().clone(), workcell.description().clone());
-        let system = System::new(workcell.robot(), &config, &description).map_err(unusable)?;
+        let system = System::new(devices, &config, &description).map_err(unusable)?;
         Ok(Opened { system, config, description, workcell: Some(workcell) })
     }
 
@@ -98,7 +125,7 @@ impl Errors {
 /// Reads the configuration and the description that it names.
 fn read(path: &Path) -> Result<(Config, Description), Failure> {
     let config = Config::read(path).map_err(unusable)?;
-    let urdf = path.parent().unwrap_or(Path::new("")).join(&config.robot);
+    let urdf = folder(path).join(&config.robot);
     let text = std::fs::read_to_string(&urdf).map_err(|error| {
         Failure::misuse(
             format!("cannot read {}: {error}", urdf.display()),
@@ -109,18 +136,24 @@ fn read(path: &Path) -> Result<(Config, Description), Failure> {
     Ok((config, description))
 }
 
+/// The folder that a configuration's paths are relative to.
+fn folder(path: &Path) -> &Path {
+    path.parent().unwrap_or(Path::new(""))
+}
+
 /// Refuses drivers that do not exist.
 fn check_drivers(config: &Config) -> Result<(), Failure> {
     let heads = Side::BOTH.map(|side| config.head(side));
+    let radio = &config.radio.driver;
     let named = heads
         .iter()
         .flat_map(|head| [&head.camera.driver, &head.servos.driver])
-        .chain([&config.radio.driver]);
+        .chain(Some(radio).filter(|driver| *driver != HCI));
     match named.into_iter().find(|driver| *driver != "sim") {
         None => Ok(()),
         Some(driver) => Err(Failure::misuse(
             format!("there is no driver \"{driver}\""),
-            "drivers are: sim (the simulated workcell, for all devices at once)",
+            "drivers are: sim (the simulated workcell) for all devices, hci for the radio too",
         )),
     }
 }

@@ -131,6 +131,7 @@ fn a_user_edits_the_workcell() {
     assert!(reason.contains("light was not seen"), "{reason}");
     for (from, to, said) in [
         ("driver = \"sim\"", "driver = \"gps\"", "gps"),
+        ("[radio]\ndriver = \"sim\"", "[radio]\ndriver = \"hci\"", "controller"),
         ("clutter = 9", "cluter = 9", "cluter"),
         ("pan_joint = \"left_pan_joint\"", "pan_joint = \"neck\"", "neck"),
         ("robot = \"workcell.urdf\"", "robot = \"nowhere.urdf\"", "nowhere.urdf"),

@@ -11,7 +11,7 @@
 //! servos = { driver = "sim" }
 //!
 //! [radio]
-//! driver = "sim"
+//! driver = "sim"                   # or driver = "hci" with tcp = "host:port" or device = "/dev/ttyACM0"
 //! ```
 //!
 //! Unknown keys are errors that name the key. What only one driver needs stands in that driver's own
@@ -66,7 +66,7 @@ pub struct Config {
     /// Right head.
     pub right: HeadConfig,
     /// Tag radio.
-    pub radio: DriverConfig,
+    pub radio: RadioConfig,
     /// The simulated workcell's own table, read by the simulator.
     #[serde(default)]
     pub sim: Option<toml::Table>,
@@ -125,12 +125,22 @@ pub struct ServosConfig {
     pub dynamixel: Option<DynamixelConfig>,
 }
 
-/// A device that needs no more than a driver's name.
+/// The tag radio's driver. The driver `hci` needs to know where its controller is: `tcp` or `device`.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct DriverConfig {
+pub struct RadioConfig {
     /// Driver name.
     pub driver: String,
+    /// Host and port of a Bluetooth controller that speaks H4 over TCP.
+    #[serde(default)]
+    pub tcp: Option<String>,
+    /// Serial line of a Bluetooth controller, its speed and raw mode set.
+    #[serde(default)]
+    pub device: Option<PathBuf>,
+    /// File that keeps the keys of tags that the robot paired with, relative to the configuration's
+    /// folder. It is secret: whoever has it commands the tags.
+    #[serde(default)]
+    pub bonds: Option<PathBuf>,
 }
 
 impl Config {

@@ -27,9 +27,9 @@ const PAIRING: Duration = Duration::from_secs(30);
 /// A controller over a transport.
 pub(crate) type Hci<T> = ExternalController<T, COMMANDS>;
 
-/// A request to the thread of a simulated radio: when it is made, and what for. The thread answers
-/// with the outcome and the time at which it came.
-pub(crate) type SimulatedRequest = (Duration, Job, Sender<(Outcome, Duration)>);
+/// A request to the thread of a simulated radio: when it is made, and what for (`None`: only to bring
+/// everything up to that time). The thread answers with the outcome and the time at which it came.
+pub(crate) type SimulatedRequest = (Duration, Option<Job>, Sender<(Outcome, Duration)>);
 
 enum Drive {
     /// The thread runs by itself on real time.
@@ -196,7 +196,7 @@ impl HciLink {
             Drive::Simulated { requests, clock } => {
                 let (reply, outcome) = mpsc::channel();
                 let now = clock.now();
-                requests.send((now, job, reply)).map_err(|_| dead())?;
+                requests.send((now, Some(job), reply)).map_err(|_| dead())?;
                 let (outcome, end) = outcome.recv().map_err(|_| dead())?;
                 clock.sleep(end.saturating_sub(now));
                 outcome

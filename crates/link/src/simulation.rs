@@ -1,11 +1,13 @@
 //! Tags and robot in one process: the firmware, the host and the air between them on virtual time.
 //!
 //! A [`VirtualRadio`] is a thread that holds everything that is not `Send`, and that runs only while
-//! a call of its [`HciLink`] is under way. A call brings the radio's time up to the robot's clock,
-//! lets everything happen until the answer is there, and makes the robot's clock sleep for the time
-//! that it took. So a run is a function of its inputs, and no faster or slower machine changes it.
+//! a call of its [`HciLink`], or of [`VirtualRadio::advance_to`], is under way. A call of the link
+//! brings the radio's time up to the robot's clock, lets everything happen until the answer is there,
+//! and makes the robot's clock sleep for the time that it took. So a run is a function of its inputs,
+//! and no faster or slower machine changes it.
 //!
-//! A tag's light is known ahead: see [`Plays`].
+//! A tag's light is known ahead: see [`Plays`]. What is told of the time before
+//! [`VirtualRadio::advance_to`] is final.
 
 use std::sync::Arc;
 use std::sync::mpsc::{self, Receiver, Sender};
@@ -16,7 +18,7 @@ use vergence_devices::{Clock, DeviceError};
 
 use crate::central::{self, LinkConfig};
 use crate::hci::{Hci, HciLink, SimulatedRequest};
-use crate::job::{Fault, Inbox};
+use crate::job::{Answer, Fault, Inbox};
 use crate::virtual_tag::{Plays, VirtualTag, spawn_tags};
 
 /// Signal strength of guests (dBm).
@@ -32,6 +34,7 @@ pub struct RadioConfig {
 }
 
 /// Tags, robot and air.
+#[derive(Debug)]
 pub struct VirtualRadio {
     requests: Sender<SimulatedRequest>,
     plays: Plays,
@@ -77,6 +80,15 @@ impl VirtualRadio {
         HciLink::simulated(self.requests.clone(), clock)
     }
 
+    /// Lets everything happen up to a time of the robot's clock; the past is ignored.
+    pub fn advance_to(&self, time: Duration) {
+        let (reply, done) = mpsc::channel();
+        if self.requests.send((time, None, reply)).is_ok() {
+            // A radio thread that is gone has nothing more to tell.
+            let _ = done.recv();
+        }
+    }
+
     /// The light of the tags.
     pub fn plays(&self) -> &Plays {
         &self.plays
@@ -114,6 +126,10 @@ fn work(
     executor.spawn(central::run(Hci::new(robot), config.link, inbox.clone()));
     while let Ok((start, job, reply)) = requests.recv() {
         executor.run_until(start);
+        let Some(job) = job else {
+            let _ = reply.send((Ok(Answer::Done), time::now()));
+            continue;
+        };
         let (sender, receiver) = mpsc::channel();
         inbox.push(job, sender);
         let mut outcome = None;

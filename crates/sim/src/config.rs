@@ -8,6 +8,9 @@ use vergence_tag::Record;
 
 use crate::error::SimError;
 
+/// Six digits.
+const MAX_PASSKEY: f64 = 999_999.0;
+
 /// The whole table.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -137,16 +140,14 @@ pub struct LightSettings {
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct RadioSettings {
-    /// Mean time from sending to the tag's action (s).
-    pub latency: f64,
-    /// Largest deviation from it (s).
-    pub jitter: f64,
-    /// Share of packets lost.
-    pub loss: f64,
     /// Reach (m).
     pub range: f64,
-    /// Time between a tag's advertisements (s).
+    /// Share of packets lost; the air sends lost ones again at the next event.
+    pub loss: f64,
+    /// Time between the advertisements of an idle tag (s).
     pub advertising_interval: f64,
+    /// Time between a link's connection events (s): a request and its answer take two.
+    pub connection_interval: f64,
 }
 
 /// A tagged object.
@@ -161,6 +162,10 @@ pub struct ObjectSettings {
     /// A cup's handle.
     #[serde(default)]
     pub handle: bool,
+    /// Passkey that is printed on the tag (six digits): who pairs with it may write the record.
+    /// Without one, every robot that pairs may.
+    #[serde(default)]
+    pub passkey: Option<u32>,
     /// Fixed place on the table (m, base).
     #[serde(default)]
     pub at: Option<[f64; 2]>,
@@ -257,11 +262,10 @@ impl Default for LightSettings {
 impl Default for RadioSettings {
     fn default() -> Self {
         RadioSettings {
-            latency: 0.03,
-            jitter: 0.015,
-            loss: 0.05,
             range: 10.0,
-            advertising_interval: 0.1,
+            loss: 0.05,
+            advertising_interval: 1.0,
+            connection_interval: 0.015,
         }
     }
 }
@@ -310,11 +314,11 @@ impl SimConfig {
             ("light.lamp_hz", l.lamp_hz, 1.0, 1e5),
             ("light.lamp_depth", l.lamp_depth, 0.0, 1.0),
             ("light.status_hz", l.status_hz, 0.0, 500.0),
-            ("radio.latency", r.latency, 0.0, 10.0),
-            ("radio.jitter", r.jitter, 0.0, r.latency),
-            ("radio.loss", r.loss, 0.0, 0.95),
             ("radio.range", r.range, 0.0, 1e4),
-            ("radio.advertising_interval", r.advertising_interval, 0.01, 60.0),
+            ("radio.loss", r.loss, 0.0, 0.95),
+            // The limits of Bluetooth; of a link that is lost after two seconds of silence.
+            ("radio.advertising_interval", r.advertising_interval, 0.02, 10.24),
+            ("radio.connection_interval", r.connection_interval, 0.0075, 0.5),
             ("clutter", self.clutter as f64, 0.0, 60.0),
         ];
         for (key, value, low, high) in ranges {
@@ -327,6 +331,15 @@ impl SimConfig {
                 .record
                 .validate()
                 .map_err(|why| SimError::Record { id: object.record.object_id.to_string(), why })?;
+            let value = object.passkey.map_or(0.0, f64::from);
+            if value > MAX_PASSKEY {
+                return Err(SimError::Range {
+                    key: "objects.passkey",
+                    value,
+                    low: 0.0,
+                    high: MAX_PASSKEY,
+                });
+            }
         }
         Ok(())
     }

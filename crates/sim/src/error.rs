@@ -1,6 +1,7 @@
 //! What can be wrong with a simulated workcell.
 
-use vergence_devices::{ConfigError, DescriptionError};
+use vergence_devices::{ConfigError, DescriptionError, DeviceError};
+use vergence_tag::cbor::MAX_BYTES;
 use vergence_tag::record::Invalid;
 
 /// Why a workcell could not be built.
@@ -38,6 +39,17 @@ pub enum SimError {
     /// A shape that cannot be drawn.
     #[error("[sim] object \"{0}\": the simulator draws box, cylinder, cup and sphere only")]
     Shape(String),
+    /// A record that no tag can hold.
+    #[error("[sim] object \"{id}\": its record has {bytes} bytes, a tag holds {MAX_BYTES}")]
+    RecordSize {
+        /// Which object.
+        id: String,
+        /// Bytes of the encoded record.
+        bytes: usize,
+    },
+    /// The radio of the tags could not be started.
+    #[error("[sim.radio]: {0}")]
+    Radio(DeviceError),
     /// No place was found.
     #[error("[sim] object \"{0}\": no free place on the table; fewer or smaller objects needed")]
     NoPlace(String),

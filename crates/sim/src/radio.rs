@@ -1,225 +1,204 @@
-//! The tags' radio on the level of packets: a stand-in for Bluetooth.
+//! The tags' radio: every tag is the real firmware on virtual Bluetooth, and so is the robot's side.
 //!
-//! Tags advertise; a packet is lost with some probability and sent again at the next interval.
-//! Commands act when they reach the tag, not when they are sent. A tag that is out of reach is
-//! silent, and asking it times out.
+//! In: where the tags are and their settings. Out: the robot's link, and what every LED plays when.
+//! Who hears whom is decided here, a transmission at a time: strength by distance with some fading,
+//! silence out of reach, losses by chance. Everything else (advertising, connection events, repeats,
+//! lost links) is what `vergence-link` and the firmware make of it.
+//!
+//! The radio's time is the world's, shifted by the time that the tags were on before the robot came.
+//! A tag's own clock is off by some parts per million: that shows in the chips of its light, which
+//! drift from the robot's clock, and is left out where it would come to a millisecond once.
 
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use rand::RngExt;
-use rand_pcg::Pcg64Mcg;
-use vergence_devices::{Advertisement, DeviceError, LedCommand, TagAddress, TagLink, TagState};
-use vergence_tag::Record;
+use vergence_devices::{Clock, TagAddress};
+use vergence_firmware::{Access, Config};
+use vergence_link::{HciLink, LinkConfig, RadioConfig, VirtualRadio, VirtualTag};
+use vergence_tag::cbor::{self, MAX_BYTES};
 
 use crate::camera::Blinker;
-use crate::config::{LedSettings, RadioSettings};
+use crate::config::{LedSettings, ObjectSettings, SimConfig};
+use crate::error::SimError;
 use crate::lights::Play;
 use crate::noise::{normal, stream};
 use crate::placement::TaggedObject;
 use crate::scene::Emitter;
-use crate::world::{Shared, World, lock};
+use crate::world::{Shared, lock};
 
-/// Bytes of a record that one packet carries.
-const PAYLOAD: usize = 20;
-/// Received strength at 1 m (dBm), and its loss per tenfold distance (dB).
+/// Received strength at 1 m (dBm), its loss per tenfold distance (dB), and the standard deviation
+/// of the fading (dB).
 const RSSI_AT_1M: f64 = -52.0;
 const RSSI_PER_DECADE: f64 = 20.0;
-/// Time between a lost packet and its repetition (s).
-const RETRY: f64 = 0.03;
+const FADING: f64 = 2.0;
+/// How long the tags were on at least before the robot came (s): they advertise slowly by then.
+const AWAKE: f64 = 60.0;
 
-/// A tag.
-#[derive(Debug, Clone)]
-pub struct Tag {
-    /// Address on the radio.
-    pub address: TagAddress,
-    /// Its record.
-    pub record: Record,
-    /// The record as it is stored.
-    pub bytes: Vec<u8>,
-    /// Seconds of its clock per second of the robot's.
-    pub rate: f64,
-    /// Battery (percent).
-    pub battery: u8,
-    /// What its LEDs play or played lately.
-    pub plays: Vec<Play>,
-}
-
-impl Tag {
-    /// Drops what no frame can show any more.
-    pub fn forget_before(&mut self, time: f64) {
-        self.plays.retain(|play| play.end >= time);
-    }
-
-    /// The tag's LEDs with what they play up to a time.
-    pub fn blinkers(
-        &self,
-        object: &TaggedObject,
-        led: &LedSettings,
-        until: f64,
-        out: &mut Vec<Blinker>,
-    ) {
-        for (index, site) in self.record.landmarks.iter().enumerate() {
-            let plays = self
-                .plays
-                .iter()
-                .filter(|play| usize::from(play.pattern.landmark) == index && play.begin <= until)
-                .copied()
-                .collect();
-            let emitter = Emitter {
-                position: object.landmark(site),
-                normal: object.normal(site),
-                lobe: led.lobe_exponent,
-                diameter: led.diameter,
-                flux_px: led.flux_px,
-            };
-            out.push(Blinker { emitter, plays });
-        }
-    }
-
-    fn obey(&mut self, command: LedCommand, now: f64, longest: f64) -> TagState {
-        for play in &mut self.plays {
-            play.end = play.end.min(now);
-        }
-        if let LedCommand::Play(pattern) = command {
-            let whole = pattern.repeats.map_or(f64::INFINITY, |repeats| {
-                f64::from(repeats) * pattern.period().as_secs_f64() / self.rate
-            });
-            let end = now + whole.min(longest / self.rate);
-            self.plays.push(Play { begin: now, end, pattern, rate: self.rate });
-        }
-        let playing = self.plays.iter().any(|play| play.end > now);
-        TagState { playing, battery: Some(self.battery) }
-    }
-}
-
-/// Randomness of the radio.
+/// All tags on their air.
 #[derive(Debug)]
-pub struct Air {
-    rng: Pcg64Mcg,
+pub struct Radio {
+    radio: VirtualRadio,
+    /// Of every tag: seconds of its clock per second of the robot's.
+    rates: Vec<f64>,
+    /// The radio's time when the robot's clock was zero.
+    epoch: Duration,
 }
 
-impl Air {
-    /// The air of a seed.
-    pub fn new(seed: u64) -> Self {
-        Air { rng: stream(seed, "radio", 0) }
-    }
-
-    fn lost(&mut self, radio: &RadioSettings) -> bool {
-        self.rng.random::<f64>() < radio.loss
-    }
-
-    /// Time until a packet has arrived, repetitions included (s).
-    fn delivery(&mut self, radio: &RadioSettings) -> f64 {
-        let mut time = radio.latency + radio.jitter * self.rng.random_range(-1.0..=1.0);
-        while self.lost(radio) {
-            time += RETRY;
+impl Radio {
+    /// The tags of these objects, switched on.
+    pub fn new(
+        settings: &SimConfig,
+        objects: &[TaggedObject],
+        seed: u64,
+    ) -> Result<Self, SimError> {
+        let mut rng = stream(seed, "tags", 0);
+        let mut tags = Vec::new();
+        let mut rates = Vec::new();
+        for (object, choices) in objects.iter().zip(&settings.objects) {
+            let mut address: [u8; 6] = rng.random();
+            address[0] |= 0xC0; // a random static address
+            rates.push(1.0 + 1e-6 * settings.led.clock_ppm * normal(&mut rng));
+            tags.push(VirtualTag {
+                address: TagAddress(address),
+                record: encoded(object)?,
+                lights: u8::try_from(object.record.landmarks.len()).unwrap_or(u8::MAX),
+                battery: rng.random_range(40..=100),
+                config: owner(settings, choices),
+            });
         }
-        time
+        let radio = settings.radio;
+        let distances: Vec<f64> =
+            objects.iter().map(|o| o.base_from_object.translation.vector.norm()).collect();
+        let mut rng = stream(seed, "radio", 0);
+        let mut config = RadioConfig {
+            link: LinkConfig {
+                interval: Duration::from_secs_f64(radio.connection_interval),
+                ..LinkConfig::default()
+            },
+            ..RadioConfig::default()
+        };
+        config.air.seed = rng.random();
+        // The robot comes at any time between two advertisements.
+        let idle = AWAKE + radio.advertising_interval * rng.random::<f64>();
+        let epoch = Duration::from_micros((1e6 * idle) as u64);
+        let chance = Mutex::new(rng);
+        let hearing = move |tag: usize| {
+            let distance = *distances.get(tag)?;
+            let mut chance = chance.lock().unwrap_or_else(PoisonError::into_inner);
+            let lost = chance.random::<f64>() < radio.loss;
+            let fading = FADING * normal(&mut chance);
+            if lost || distance > radio.range {
+                return None;
+            }
+            let rssi = RSSI_AT_1M - RSSI_PER_DECADE * distance.max(0.1).log10() + fading;
+            Some(rssi.round().clamp(-110.0, 0.0) as i8)
+        };
+        let radio =
+            VirtualRadio::new(config, tags, Duration::ZERO, hearing).map_err(SimError::Radio)?;
+        Ok(Radio { radio, rates, epoch })
     }
+
+    /// Lets everything happen up to a time of the robot's clock.
+    pub fn advance_to(&self, time: Duration) {
+        self.radio.advance_to(time.saturating_add(self.epoch));
+    }
+
+    /// Forgets what ended before a time (s), which no frame can show any more.
+    pub fn forget_plays_before(&self, time: f64) {
+        let time = Duration::try_from_secs_f64(time).unwrap_or_default();
+        self.radio.plays().forget_before(time + self.epoch);
+    }
+
+    /// What the LEDs of a tag play or played lately, but for what begins after a time (s).
+    pub fn plays(&self, tag: usize, until: f64) -> Vec<Play> {
+        let rate = self.rates.get(tag).copied().unwrap_or(1.0);
+        let epoch = self.epoch.as_secs_f64();
+        self.radio
+            .plays()
+            .of(tag)
+            .iter()
+            .map(|play| Play {
+                begin: play.begin.as_secs_f64() - epoch,
+                end: play.end.as_secs_f64() - epoch,
+                pattern: play.pattern,
+                rate,
+            })
+            .filter(|play| play.begin <= until)
+            .collect()
+    }
+}
+
+/// The record as the tag stores it.
+fn encoded(object: &TaggedObject) -> Result<Vec<u8>, SimError> {
+    let mut bytes = Vec::new();
+    let whole = cbor::encode(&object.record, &mut bytes);
+    match whole.is_ok() && bytes.len() <= MAX_BYTES {
+        true => Ok(bytes),
+        false => Err(SimError::RecordSize {
+            id: object.record.object_id.to_string(),
+            bytes: bytes.len(),
+        }),
+    }
+}
+
+/// What the owner of a tag chose.
+fn owner(settings: &SimConfig, object: &ObjectSettings) -> Config<'static> {
+    let time = |seconds: f64| embassy_time::Duration::from_micros((1e6 * seconds) as u64);
+    let defaults = Config::default();
+    let slow_interval = time(settings.radio.advertising_interval);
+    Config {
+        model: "simulated tag",
+        passkey: object.passkey,
+        write_access: match object.passkey {
+            Some(_) => Access::Authenticated,
+            None => Access::Encrypted,
+        },
+        longest_play: time(settings.led.longest_play),
+        fast_interval: defaults.fast_interval.min(slow_interval),
+        slow_interval,
+        ..defaults
+    }
+}
+
+/// The LEDs of a tag with what they play.
+pub fn blinkers<'a>(
+    object: &'a TaggedObject,
+    led: &'a LedSettings,
+    plays: &'a [Play],
+) -> impl Iterator<Item = Blinker> + 'a {
+    object.record.landmarks.iter().enumerate().map(move |(index, site)| {
+        let own = plays.iter().filter(|play| usize::from(play.pattern.landmark) == index);
+        let emitter = Emitter {
+            position: object.landmark(site),
+            normal: object.normal(site),
+            lobe: led.lobe_exponent,
+            diameter: led.diameter,
+            flux_px: led.flux_px,
+        };
+        Blinker { emitter, plays: own.copied().collect() }
+    })
 }
 
 /// The robot's radio.
-pub struct SimRadio {
+pub fn link(world: &Shared) -> HciLink {
+    let held = lock(world);
+    let clock = RadioClock { world: world.clone(), epoch: held.radio.epoch };
+    held.radio.radio.link(Arc::new(clock))
+}
+
+/// The world's clock as the radio counts it.
+struct RadioClock {
     world: Shared,
+    epoch: Duration,
 }
 
-impl SimRadio {
-    pub(crate) fn new(world: Shared) -> Self {
-        SimRadio { world }
-    }
-}
-
-/// Index of a tag that can be reached.
-fn reach(world: &World, address: TagAddress) -> Option<usize> {
-    let index = world.tags.iter().position(|tag| tag.address == address)?;
-    let distance = world.objects.get(index)?.base_from_object.translation.vector.norm();
-    (distance <= world.settings.radio.range).then_some(index)
-}
-
-/// Lets the radio work for some time; an error when it takes longer than allowed.
-fn spend(
-    world: &mut World,
-    time: f64,
-    deadline: f64,
-    timeout: Duration,
-) -> Result<(), DeviceError> {
-    let end = world.seconds() + time;
-    world.advance_to(Duration::from_secs_f64(end.min(deadline)));
-    match end <= deadline {
-        true => Ok(()),
-        false => Err(DeviceError::Timeout { device: "tag radio".into(), timeout }),
-    }
-}
-
-impl TagLink for SimRadio {
-    fn scan(&mut self, window: Duration) -> Result<Vec<Advertisement>, DeviceError> {
-        let mut world = lock(&self.world);
-        let world = &mut *world;
-        let radio = world.settings.radio;
-        let packets = (window.as_secs_f64() / radio.advertising_interval).floor() as usize;
-        let mut heard = Vec::new();
-        for (tag, object) in world.tags.iter().zip(&world.objects) {
-            let distance = object.base_from_object.translation.vector.norm().max(0.1);
-            let arrived = (0..packets).filter(|_| !world.air.lost(&radio)).count();
-            let fading = 2.0 * normal(&mut world.air.rng);
-            if arrived == 0 || distance > radio.range {
-                continue;
-            }
-            let rssi = RSSI_AT_1M - RSSI_PER_DECADE * distance.log10() + fading;
-            heard.push(Advertisement {
-                address: tag.address,
-                object_id: tag.record.object_id.to_string(),
-                rssi: rssi.round().clamp(-110.0, 0.0) as i8,
-                battery: Some(tag.battery),
-            });
-        }
-        world.pass(window);
-        heard.sort_by(|a, b| b.rssi.cmp(&a.rssi).then(a.address.cmp(&b.address)));
-        Ok(heard)
+impl Clock for RadioClock {
+    fn now(&self) -> Duration {
+        lock(&self.world).now.saturating_add(self.epoch)
     }
 
-    fn read_record(&mut self, tag: TagAddress, timeout: Duration) -> Result<Vec<u8>, DeviceError> {
-        let mut world = lock(&self.world);
-        let deadline = world.seconds() + timeout.as_secs_f64();
-        let Some(index) = reach(&world, tag) else {
-            spend(&mut world, f64::INFINITY, deadline, timeout)?;
-            return Ok(Vec::new());
-        };
-        let packets = world.tags[index].bytes.len().div_ceil(PAYLOAD);
-        for _ in 0..packets.max(1) {
-            let radio = world.settings.radio;
-            let time = world.air.delivery(&radio);
-            spend(&mut world, time, deadline, timeout)?;
-        }
-        Ok(world.tags[index].bytes.clone())
-    }
-
-    fn command(
-        &mut self,
-        tag: TagAddress,
-        command: LedCommand,
-        timeout: Duration,
-    ) -> Result<TagState, DeviceError> {
-        let mut world = lock(&self.world);
-        let deadline = world.seconds() + timeout.as_secs_f64();
-        let Some(index) = reach(&world, tag) else {
-            spend(&mut world, f64::INFINITY, deadline, timeout)?;
-            return Ok(TagState { playing: false, battery: None });
-        };
-        if let LedCommand::Play(pattern) = command {
-            let lights = world.tags[index].record.landmarks.len();
-            if usize::from(pattern.landmark) >= lights {
-                let what = format!("has no light {}, only {lights}", pattern.landmark);
-                return Err(DeviceError::Unsupported { device: format!("tag {tag}"), what });
-            }
-        }
-        let radio = world.settings.radio;
-        let out = world.air.delivery(&radio);
-        spend(&mut world, out, deadline, timeout)?;
-        let (now, longest) = (world.seconds(), world.settings.led.longest_play);
-        let state = world.tags[index].obey(command, now, longest);
-        let back = world.air.delivery(&radio);
-        spend(&mut world, back, deadline, timeout)?;
-        Ok(state)
+    fn sleep(&self, duration: Duration) {
+        lock(&self.world).pass(duration);
     }
 }

@@ -164,6 +164,7 @@ fn random_object(rng: &mut Pcg64Mcg) -> ObjectSettings {
         },
         surface,
         handle: kind == 2 && rng.random::<bool>(),
+        passkey: None,
         at: None,
         yaw_deg: None,
     }

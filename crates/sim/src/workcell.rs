@@ -7,8 +7,9 @@ use std::time::Duration;
 
 use nalgebra::{Point3, Unit, UnitQuaternion, Vector3};
 use rand::RngExt;
-use vergence_devices::{Config, Description, Head, Robot, Side, TagAddress};
+use vergence_devices::{Clock, Config, Description, Head, Robot, Side};
 use vergence_geometry::{Camera as Lens, Chain, Transform};
+use vergence_link::HciLink;
 use vergence_tag::{Pattern, pattern::Bits};
 
 use crate::camera::{Blinker, Sensor};
@@ -17,8 +18,8 @@ use crate::devices::{SimCamera, SimClock, SimPanTilt};
 use crate::error::SimError;
 use crate::lights::Play;
 use crate::noise::{normal, stream};
-use crate::placement::{RestView, TaggedObject, compose};
-use crate::radio::{Air, SimRadio, Tag};
+use crate::placement::{RestView, compose};
+use crate::radio::{self, Radio};
 use crate::servo::Servo;
 use crate::trace::Stage;
 use crate::world::{Shared, Shutter, TrueHead, World, lock};
@@ -107,7 +108,7 @@ impl Workcell {
             heads.try_into().map_err(|_| SimError::Table("two heads".into()))?;
         let views = [views[0], views[1]];
         let composition = compose(&settings, &views, seed)?;
-        let tags = tags(&settings, &composition.objects, seed);
+        let radio = Radio::new(&settings, &composition.objects, seed)?;
         let status = composition.status.map(|emitter| {
             let half = Duration::from_secs_f64(0.5 / settings.light.status_hz);
             let plays = status_play(half, seed).into_iter().collect();
@@ -128,8 +129,7 @@ impl Workcell {
         let world = World {
             heads: [left, right],
             objects: composition.objects,
-            tags,
-            air: Air::new(seed),
+            radio,
             status,
             stage: Arc::new(Stage::new(composition.scene)),
             shutter: Shutter { phase, period, exposure: c.exposure, readout },
@@ -154,11 +154,17 @@ impl Workcell {
                 pan_tilt: Box::new(SimPanTilt { world, side }),
             }
         };
-        Robot {
-            clock: Box::new(SimClock { world: self.world.clone() }),
-            heads: Side::BOTH.map(head),
-            radio: Box::new(SimRadio::new(self.world.clone())),
-        }
+        Robot { clock: self.clock(), heads: Side::BOTH.map(head), radio: Box::new(self.radio()) }
+    }
+
+    /// The clock of all its devices.
+    pub fn clock(&self) -> Box<dyn Clock> {
+        Box::new(SimClock { world: self.world.clone() })
+    }
+
+    /// Opens the tag radio alone. All radios of one workcell are the same.
+    pub fn radio(&self) -> HciLink {
+        radio::link(&self.world)
     }
 
     /// What is really so, at this moment.
@@ -239,28 +245,6 @@ fn true_head(
     let speed = |k: usize| chain.joints.get(k).map_or(1.0, |joint| joint.limits.velocity);
     let servos = [0, 1].map(|k| Servo::new(&settings.servos, speed(k)));
     TrueHead { chain, lens, servos }
-}
-
-fn tags(settings: &SimConfig, objects: &[TaggedObject], seed: u64) -> Vec<Tag> {
-    let mut rng = stream(seed, "tags", 0);
-    let tag = |object: &TaggedObject| {
-        let mut address: [u8; 6] = rng.random();
-        address[0] |= 0xC0; // a random static address
-        let mut bytes = Vec::new();
-        // A Vec cannot refuse bytes, and records were validated; an empty record shows if ever.
-        if vergence_tag::cbor::encode(&object.record, &mut bytes).is_err() {
-            bytes.clear();
-        }
-        Tag {
-            address: TagAddress(address),
-            record: object.record.clone(),
-            bytes,
-            rate: 1.0 + 1e-6 * settings.led.clock_ppm * normal(&mut rng),
-            battery: rng.random_range(40..=100),
-            plays: Vec::new(),
-        }
-    };
-    objects.iter().map(tag).collect()
 }
 
 /// The status light has always been blinking.

@@ -14,7 +14,7 @@ use vergence_geometry::{Camera as Lens, Chain, Transform};
 use crate::camera::{Blinker, Capture};
 use crate::config::SimConfig;
 use crate::placement::TaggedObject;
-use crate::radio::{Air, Tag};
+use crate::radio::{self, Radio};
 use crate::servo::Servo;
 use crate::trace::Stage;
 
@@ -70,8 +70,7 @@ pub struct World {
     pub(crate) settings: SimConfig,
     pub(crate) heads: [TrueHead; 2],
     pub(crate) objects: Vec<TaggedObject>,
-    pub(crate) tags: Vec<Tag>,
-    pub(crate) air: Air,
+    pub(crate) radio: Radio,
     pub(crate) status: Option<Blinker>,
     pub(crate) stage: Arc<Stage>,
     pub(crate) shutter: Shutter,
@@ -104,6 +103,8 @@ impl World {
 
     /// Moves the clock to a time; the past is ignored.
     pub fn advance_to(&mut self, time: Duration) {
+        // The lights first: frames show them as they are until then.
+        self.radio.advance_to(time);
         let until = time.as_secs_f64();
         loop {
             if self.exposing.is_none() {
@@ -131,9 +132,10 @@ impl World {
         let (start, end) = (self.shutter.start(self.frame), self.shutter.end(self.frame));
         if let Some(base_from_optical) = self.exposing.take() {
             let mut blinkers = Vec::new();
-            for (tag, object) in self.tags.iter_mut().zip(&self.objects) {
-                tag.forget_before(start);
-                tag.blinkers(object, &self.settings.led, end, &mut blinkers);
+            self.radio.forget_plays_before(start);
+            for (index, object) in self.objects.iter().enumerate() {
+                let plays = self.radio.plays(index, end);
+                blinkers.extend(radio::blinkers(object, &self.settings.led, &plays));
             }
             blinkers.extend(self.status.clone());
             let stage = self.stage.clone();

@@ -40,7 +40,7 @@ fn next(head: &mut Head) -> Frame {
 }
 
 fn address(robot: &mut Robot, id: &str) -> TagAddress {
-    let heard = robot.radio.scan(2 * SECOND).unwrap();
+    let heard = robot.radio.scan(3 * SECOND).unwrap();
     heard.iter().find(|a| a.object_id == id).unwrap().address
 }
 
@@ -126,7 +126,7 @@ fn equal_seeds_give_equal_bytes() {
     let run = |seed: u64| {
         let cell = Workcell::embedded(seed).unwrap();
         let mut robot = cell.robot();
-        let heard = robot.radio.scan(SECOND).unwrap();
+        let heard = robot.radio.scan(3 * SECOND).unwrap();
         let record = robot.radio.read_record(heard[0].address, 5 * SECOND).unwrap();
         let landmark = cell.truth().objects[0].landmarks[0];
         aim(&cell, &mut robot, &landmark);
@@ -191,7 +191,10 @@ fn the_radio_has_a_reach_and_keeps_records() {
         let record = cbor::decode(&bytes).unwrap();
         assert_eq!(record.object_id.as_str(), advertisement.object_id);
         assert!(bytes.len() <= 512, "{} bytes", bytes.len());
-        assert!(robot.clock.now() > before + Duration::from_millis(50), "packets take time");
+        assert!(
+            robot.clock.now() > before + Duration::from_millis(50),
+            "connection events take time"
+        );
     }
     let before = robot.clock.now();
     let nobody = robot.radio.read_record(TagAddress([1; 6]), 2 * SECOND);
@@ -200,7 +203,7 @@ fn the_radio_has_a_reach_and_keeps_records() {
     let tag = address(&mut robot, "can");
     let wrong = Pattern { landmark: 3, ..slow_flicker() };
     let refused = robot.radio.command(tag, LedCommand::Play(wrong), SECOND);
-    assert!(matches!(refused, Err(DeviceError::Unsupported { .. })));
+    assert!(matches!(refused, Err(DeviceError::Fault { .. })));
 }
 
 #[test]

@@ -55,7 +55,7 @@ impl Default for FindConfig {
     fn default() -> Self {
         FindConfig {
             method: Method::default(),
-            scan_window: Duration::from_millis(1500),
+            scan_window: Duration::from_millis(2500),
             link_timeout: Duration::from_secs(2),
             link_tries: 3,
             search_tries: 3,

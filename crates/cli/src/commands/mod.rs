@@ -6,6 +6,7 @@ mod evaluate;
 mod experiment;
 mod find;
 mod pose;
+mod tag;
 mod tags;
 mod workcell;
 
@@ -20,6 +21,8 @@ pub enum Command {
     Find(find::Find),
     /// List the tags in radio range with their records.
     Tags(tags::Tags),
+    /// Work on one tag: write its record, blink its light, pair with it, ask what it is.
+    Tag(tag::Tag),
     /// Run one of the paper's experiments in the simulated workcell, with statistics.
     Experiment(experiment::Experiment),
     /// Measure how accurate and fast a part of the system is, in simulation.
@@ -37,6 +40,7 @@ pub fn run(command: Command) -> Result<bool, Failure> {
     match command {
         Command::Find(args) => find::run(&args),
         Command::Tags(args) => tags::run(&args),
+        Command::Tag(args) => tag::run(&args),
         Command::Experiment(args) => experiment::run(&args),
         Command::Evaluate(args) => evaluate::run(args),
         Command::Workcell(args) => workcell::run(&args),

@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use clap::Args;
 use serde::Serialize;
+use vergence_devices::TagLink;
 use vergence_tag::Record;
 
 use crate::failure::Failure;
@@ -42,8 +43,7 @@ struct Tag {
 
 /// Runs the command.
 pub fn run(args: &Tags) -> Result<bool, Failure> {
-    let mut robot = args.robot.open()?;
-    let radio = &mut robot.system.robot.radio;
+    let mut radio = args.robot.open_radio()?.link;
     let hint = "check the radio's driver in the configuration";
     let heard = radio.scan(WINDOW).map_err(|error| Failure::failed(error, hint))?;
     let tags: Vec<Tag> = heard

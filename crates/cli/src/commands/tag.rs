@@ -1,0 +1,275 @@
+//! `vergence tag ...`: work on one tag over the radio: what it is, its light, its record, pairing.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use clap::{Args, Subcommand};
+use serde::Serialize;
+use vergence_devices::{DeviceError, TagAddress, TagLink};
+use vergence_tag::{Pattern, Record, cbor, pattern::Bits};
+
+use crate::failure::Failure;
+use crate::radio::Radio;
+use crate::robot::RobotArgs;
+
+/// Work on one tag: write its record, blink its light, pair with it, ask what it is.
+#[derive(Args)]
+pub struct Tag {
+    #[command(subcommand)]
+    action: Action,
+}
+
+#[derive(Subcommand)]
+enum Action {
+    /// Give a tag a new record.
+    Write(Write),
+    /// Play a pattern on a tag's light.
+    Blink(Blink),
+    /// Pair with a tag: its owner's proof that this robot may command it.
+    Pair(Pair),
+    /// Tell what a tag is and how it does.
+    Info(Info),
+}
+
+#[derive(Args)]
+struct Write {
+    /// The record (TOML, or JSON when the name ends in .json).
+    file: PathBuf,
+    /// The tag's address; else the tag that carries the record's object id now.
+    #[arg(long, value_name = "ADDRESS", value_parser = address)]
+    to: Option<TagAddress>,
+    /// Pair first with the six digits that are printed on the tag.
+    #[arg(long, value_parser = clap::value_parser!(u32).range(0..=999_999))]
+    passkey: Option<u32>,
+    /// Pair first, with a tag that has no passkey.
+    #[arg(long, conflicts_with = "passkey")]
+    pair: bool,
+    #[command(flatten)]
+    robot: RobotArgs,
+}
+
+#[derive(Args)]
+struct Blink {
+    /// Object id or address of the tag.
+    id: String,
+    /// Chips in order of time: 1 is on, 0 is off.
+    #[arg(long, default_value = "10")]
+    pattern: Bits,
+    /// How long a chip lasts (ms).
+    #[arg(long, default_value_t = 100.0)]
+    chip_ms: f64,
+    /// How long the light plays (s).
+    #[arg(long, default_value_t = 5.0)]
+    seconds: f64,
+    #[command(flatten)]
+    robot: RobotArgs,
+}
+
+#[derive(Args)]
+struct Pair {
+    /// Object id or address of the tag.
+    id: String,
+    /// The six digits that are printed on the tag; without them the pairing proves nothing.
+    #[arg(long, value_parser = clap::value_parser!(u32).range(0..=999_999))]
+    passkey: Option<u32>,
+    #[command(flatten)]
+    robot: RobotArgs,
+}
+
+#[derive(Args)]
+struct Info {
+    /// Object id or address of the tag.
+    id: String,
+    #[command(flatten)]
+    robot: RobotArgs,
+    /// Print the result as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Serialize)]
+struct InfoOutput {
+    address: String,
+    manufacturer: String,
+    model: String,
+    firmware: String,
+    battery: Option<u8>,
+    has_record: bool,
+    playing: bool,
+    rssi: Option<i8>,
+}
+
+/// How long the radio listens: idle tags advertise about once a second.
+const WINDOW: Duration = Duration::from_millis(2500);
+/// Longest wait for one answer.
+const TIMEOUT: Duration = Duration::from_secs(5);
+
+/// Runs the command.
+pub fn run(args: &Tag) -> Result<bool, Failure> {
+    match &args.action {
+        Action::Write(args) => write(args),
+        Action::Blink(args) => blink(args),
+        Action::Pair(args) => pair(args),
+        Action::Info(args) => info(args),
+    }
+}
+
+fn write(args: &Write) -> Result<bool, Failure> {
+    let record = read_record(&args.file)?;
+    let bytes = encoded(&record, &args.file)?;
+    let mut radio = args.robot.open_radio()?;
+    let tag = match args.to {
+        // Listening tells whether the address is a public one.
+        Some(tag) => radio.link.scan(WINDOW).map(|_| tag).map_err(failed)?,
+        None => find(&mut radio, &record.object_id)?,
+    };
+    if args.pair || args.passkey.is_some() {
+        bond(&mut radio, tag, args.passkey)?;
+    }
+    radio.link.write_record(tag, &bytes, TIMEOUT).map_err(failed)?;
+    println!("{tag} now is \"{}\" ({} bytes)", record.object_id, bytes.len());
+    Ok(true)
+}
+
+fn blink(args: &Blink) -> Result<bool, Failure> {
+    let time = |value: f64, unit: f64, name: &str| {
+        Duration::try_from_secs_f64(value * unit).map_err(|error| {
+            Failure::misuse(format!("{name} {value}: {error}"), "give a positive number")
+        })
+    };
+    let chip = time(args.chip_ms, 1e-3, "--chip-ms")?;
+    let limit = time(args.seconds, 1.0, "--seconds")?;
+    let pattern = Pattern::new(args.pattern, chip)
+        .map_err(|error| Failure::misuse(error, "choose another --chip-ms"))?;
+    let mut radio = args.robot.open_radio()?;
+    let tag = find(&mut radio, &args.id)?;
+    radio.link.play_for(tag, pattern, limit, TIMEOUT).map_err(failed)?;
+    eprintln!("{tag} plays {} for {:.1} s", args.pattern, limit.as_secs_f64());
+    // The tag goes dark when its robot is gone, so that the robot must stay.
+    radio.clock.sleep(limit);
+    radio.link.release(tag).map_err(failed)?;
+    Ok(true)
+}
+
+fn pair(args: &Pair) -> Result<bool, Failure> {
+    let mut radio = args.robot.open_radio()?;
+    let tag = find(&mut radio, &args.id)?;
+    let kept = bond(&mut radio, tag, args.passkey)?;
+    println!("paired with {tag}");
+    if !kept {
+        println!(
+            "  the key is not kept: add bonds = \"tags.bonds\" to [radio] of the configuration"
+        );
+    }
+    Ok(true)
+}
+
+fn info(args: &Info) -> Result<bool, Failure> {
+    let mut radio = args.robot.open_radio()?;
+    let tag = find(&mut radio, &args.id)?;
+    let told = radio.link.info(tag, TIMEOUT).map_err(failed)?;
+    let output = InfoOutput {
+        address: tag.to_string(),
+        manufacturer: told.manufacturer,
+        model: told.model,
+        firmware: told.firmware,
+        battery: told.battery,
+        has_record: told.has_record,
+        playing: told.playing,
+        rssi: told.rssi,
+    };
+    if args.json {
+        crate::output::json(&output)?;
+        return Ok(true);
+    }
+    println!("address   {}", output.address);
+    println!("tag       {} {}", output.manufacturer, output.model);
+    println!("firmware  {}", output.firmware);
+    println!("battery   {}", output.battery.map_or("unknown".into(), |b| format!("{b} %")));
+    println!("signal    {}", output.rssi.map_or("unknown".into(), |r| format!("{r} dBm")));
+    println!("record    {}", if output.has_record { "yes" } else { "none" });
+    println!("light     {}", if output.playing { "plays" } else { "dark" });
+    Ok(true)
+}
+
+/// Pairs and keeps the bond; true when it outlasts this run.
+fn bond(radio: &mut Radio, tag: TagAddress, passkey: Option<u32>) -> Result<bool, Failure> {
+    let bond = radio.link.pair(tag, passkey).map_err(|error| {
+        Failure::failed(error, "compare the passkey with the one printed on the tag; after a wrong one the tag makes every robot wait")
+    })?;
+    bond.map_or(Ok(false), |bond| radio.keep(&bond))
+}
+
+/// The tag of an object id or an address. One id on two tags is an error: one of them is not what
+/// it says.
+fn find(radio: &mut Radio, id: &str) -> Result<TagAddress, Failure> {
+    let heard = radio.link.scan(WINDOW).map_err(failed)?;
+    if let Ok(tag) = address(id) {
+        return Ok(tag);
+    }
+    let tags: Vec<TagAddress> =
+        heard.iter().filter(|tag| tag.object_id == id).map(|tag| tag.address).collect();
+    match tags[..] {
+        [tag] => Ok(tag),
+        [] => {
+            let names: Vec<&str> = heard.iter().map(|tag| tag.object_id.as_str()).collect();
+            let names = if names.is_empty() { "nobody".into() } else { names.join(", ") };
+            Err(Failure::failed(
+                format!("no tag of \"{id}\" answers on the radio (heard: {names})"),
+                "look at `vergence tags`; a tag without a record is named by its address",
+            ))
+        }
+        _ => {
+            let all: Vec<String> = tags.iter().map(TagAddress::to_string).collect();
+            Err(Failure::failed(
+                format!("{} tags say that they are \"{id}\": {}", all.len(), all.join(", ")),
+                "name the one that is meant by its address",
+            ))
+        }
+    }
+}
+
+/// Six bytes in hexadecimal with colons, as `vergence tags` shows them.
+fn address(text: &str) -> Result<TagAddress, String> {
+    let bytes: Option<Vec<u8>> = text
+        .split(':')
+        .map(|byte| (byte.len() == 2).then(|| u8::from_str_radix(byte, 16).ok()).flatten())
+        .collect();
+    let bytes = bytes.and_then(|bytes| <[u8; 6]>::try_from(bytes).ok());
+    bytes.map(TagAddress).ok_or_else(|| "an address looks like C0:12:34:56:78:9A".into())
+}
+
+fn read_record(path: &Path) -> Result<Record, Failure> {
+    let hint =
+        "a record looks like those of `vergence tags --json`, and docs/record.cddl tells all";
+    let wrong = |error: String| Failure::misuse(format!("{}: {error}", path.display()), hint);
+    let text = std::fs::read_to_string(path).map_err(|error| wrong(error.to_string()))?;
+    let record: Record = match path.extension().is_some_and(|extension| extension == "json") {
+        true => serde_json::from_str(&text).map_err(|error| wrong(error.to_string()))?,
+        false => toml::from_str(&text).map_err(|error| wrong(error.to_string()))?,
+    };
+    record.validate().map_err(|error| wrong(error.to_string()))?;
+    Ok(record)
+}
+
+fn encoded(record: &Record, path: &Path) -> Result<Vec<u8>, Failure> {
+    let mut bytes = Vec::new();
+    let whole = cbor::encode(record, &mut bytes);
+    match whole.is_ok() && bytes.len() <= cbor::MAX_BYTES {
+        true => Ok(bytes),
+        false => Err(Failure::misuse(
+            format!("{}: the record has {} bytes", path.display(), bytes.len()),
+            format!("a tag holds {}: use fewer vertices", cbor::MAX_BYTES),
+        )),
+    }
+}
+
+fn failed(error: DeviceError) -> Failure {
+    let hint = match error {
+        DeviceError::Fault { .. } => {
+            "when the tag refuses robots that are not paired: `vergence tag pair`, or --passkey"
+        }
+        _ => "move the robot closer, check the tag's battery and `vergence tags`",
+    };
+    Failure::failed(error, hint)
+}

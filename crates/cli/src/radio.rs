@@ -1,0 +1,84 @@
+//! Opens the tag radio alone: no camera or servo is needed to talk to tags.
+
+use std::io::{Read, Write};
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::{Path, PathBuf};
+
+use vergence_devices::clock::SystemClock;
+use vergence_devices::{Clock, Config};
+use vergence_link::{BOND_BYTES, Bond, HciLink, LinkConfig};
+use vergence_sim::Workcell;
+
+use crate::failure::Failure;
+
+/// An opened radio.
+pub struct Radio {
+    /// The radio.
+    pub link: HciLink,
+    /// The time that it runs on.
+    pub clock: Box<dyn Clock>,
+    /// Where its bonds are kept.
+    bonds: Option<PathBuf>,
+}
+
+/// Opens the controller that the driver `hci` names, with the bonds of earlier runs.
+pub fn open(config: &Config, folder: &Path) -> Result<Radio, Failure> {
+    let radio = &config.radio;
+    let link = match (&radio.tcp, &radio.device) {
+        (Some(address), None) => HciLink::tcp(address, LinkConfig::default()),
+        (None, Some(path)) => HciLink::device(&path.to_string_lossy(), LinkConfig::default()),
+        _ => {
+            return Err(Failure::misuse(
+                "the radio driver \"hci\" needs one controller",
+                "write tcp = \"host:port\" or device = \"/dev/ttyACM0\" into [radio]",
+            ));
+        }
+    };
+    let link = link.map_err(|error| Failure::failed(error, "is the controller there and free?"))?;
+    let bonds = radio.bonds.as_ref().map(|file| folder.join(file));
+    let mut radio = Radio { link, clock: Box::new(SystemClock::start()), bonds };
+    radio.load()?;
+    Ok(radio)
+}
+
+impl Radio {
+    /// The radio of a simulated workcell, whose tags and bonds live as long as the program.
+    pub fn simulated(workcell: &Workcell) -> Self {
+        Radio { link: workcell.radio(), clock: workcell.clock(), bonds: None }
+    }
+
+    /// Takes up the bonds of earlier runs.
+    fn load(&mut self) -> Result<(), Failure> {
+        let Some(path) = self.bonds.as_ref().filter(|path| path.exists()) else { return Ok(()) };
+        let mut bytes = Vec::new();
+        let read = std::fs::File::open(path).and_then(|mut file| file.read_to_end(&mut bytes));
+        read.map_err(|error| unusable(path, error))?;
+        let (bonds, rest) = bytes.as_chunks::<BOND_BYTES>();
+        if !rest.is_empty() {
+            return Err(unusable(path, "it is cut short"));
+        }
+        for bond in bonds {
+            let added = self.link.add_bond(Bond::from_bytes(*bond));
+            added.map_err(|error| unusable(path, error))?;
+        }
+        Ok(())
+    }
+
+    /// Keeps a bond for later runs; false when no file is configured. A later bond with the same tag
+    /// takes the place of an earlier one when it is read.
+    pub fn keep(&self, bond: &Bond) -> Result<bool, Failure> {
+        let Some(path) = &self.bonds else { return Ok(false) };
+        let mut options = std::fs::File::options();
+        let file = options.append(true).create(true).mode(0o600).open(path);
+        file.and_then(|mut file| file.write_all(&bond.to_bytes()))
+            .map_err(|error| unusable(path, error))?;
+        Ok(true)
+    }
+}
+
+fn unusable(path: &Path, error: impl std::fmt::Display) -> Failure {
+    Failure::failed(
+        format!("{}: {error}", path.display()),
+        "the file of the key `bonds` must be writable; remove it to pair with all tags anew",
+    )
+}
