@@ -76,7 +76,7 @@ enum Stop {
     #[error("the tag advertises \"{advertised}\" but its record says \"{recorded}\"")]
     WrongRecord { advertised: String, recorded: String },
     #[error("the tag answers, but its light was not seen in {views} views by {missing}")]
-    NotSeen { views: usize, missing: &'static str },
+    NotSeen { views: usize, missing: Missing },
     #[error("the light that the {0} head saw was lost or did not obey when it was centred")]
     Lost(&'static str),
     #[error("the two heads do not see one and the same light: {0}")]
@@ -87,6 +87,24 @@ enum Stop {
     Refused(#[from] Refusal),
     #[error("{0}")]
     Device(#[from] DeviceError),
+}
+
+/// Who did not see the light.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Missing {
+    /// Neither head did.
+    Either,
+    /// One did not while the other did.
+    One(Side),
+}
+
+impl std::fmt::Display for Missing {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Missing::Either => f.write_str("either head"),
+            Missing::One(side) => write!(f, "the {} head", side.name()),
+        }
+    }
 }
 
 impl Stop {
@@ -181,9 +199,9 @@ impl Run<'_> {
         self.step("recognise", |run| run.recognise(&record, landmark, &frames, angles))
     }
 
-    /// Search, centring and triangulation, while the light blinks. A light that does not obey the
-    /// challenge, or that the heads see at two places, was not the tag's: the search goes on with
-    /// the new pattern, which what misled it does not play.
+    /// Search, centring and triangulation, while the light blinks. A light that only one head sees,
+    /// that does not obey the challenge, or that the heads see at two places, was not the tag's: the
+    /// search goes on with a new pattern, which what misled it does not play.
     fn locate(
         &mut self,
         tag: TagAddress,
@@ -191,10 +209,16 @@ impl Run<'_> {
     ) -> Result<(GaussianPoint, [[f64; 2]; 2]), Stop> {
         let mut tries = 1;
         loop {
-            let seen = self.step("search", |run| run.search(&pattern))?;
-            pattern = self.step("challenge", |run| run.challenge(tag, pattern))?;
-            match self.fixate(&pattern, seen) {
-                Err(Stop::Lost(_) | Stop::Triangulation(_)) if tries < self.config.search_tries => {
+            let seen = self.step("search", |run| run.search(&pattern));
+            if !matches!(seen, Err(Stop::NotSeen { missing: Missing::Either, .. })) {
+                pattern = self.step("challenge", |run| run.challenge(tag, pattern))?;
+            }
+            match seen.and_then(|seen| self.fixate(&pattern, seen)) {
+                Err(
+                    Stop::Lost(_)
+                    | Stop::Triangulation(_)
+                    | Stop::NotSeen { missing: Missing::One(_), .. },
+                ) if tries < self.config.search_tries => {
                     tries += 1;
                 }
                 outcome => return outcome,

@@ -1,11 +1,11 @@
 //! Step 2 of the paper: both heads sweep until both have seen the light.
 
-use vergence_devices::JointReading;
+use vergence_devices::{JointReading, Side};
 use vergence_head::{Field, Search, SearchConfig};
 use vergence_landmark::Sighting;
 use vergence_tag::Pattern;
 
-use super::{Run, Stop};
+use super::{Missing, Run, Stop};
 
 /// Where one head saw the light, at which angles.
 #[derive(Debug, Clone)]
@@ -47,9 +47,9 @@ impl Run<'_> {
             }
         }
         let missing = match seen {
-            [None, None] => "either head",
-            [None, _] => "the left head",
-            _ => "the right head",
+            [None, None] => Missing::Either,
+            [None, _] => Missing::One(Side::Left),
+            _ => Missing::One(Side::Right),
         };
         Err(Stop::NotSeen { views, missing })
     }
