@@ -193,9 +193,11 @@ fn prepare<'a>(
             let region = Region::around((pixel.x, pixel.y), reach_px, width, height)?;
             let coarse = Level::new(view.image, &region, scale);
             let fine = (scale > 1).then(|| Level::new(view.image, &region, 1));
-            let field = search
-                .then(|| Field::new(&edges::edgels(&coarse), coarse.width(), coarse.height()))
-                .unwrap_or_default();
+            let field = if search {
+                Field::new(&edges::edgels(&coarse), coarse.width(), coarse.height())
+            } else {
+                Field::default()
+            };
             let straight = view.camera.distortion.is_none();
             Some(Sight { view: *view, optical_from_base, straight, coarse, fine, field })
         })

@@ -1,7 +1,7 @@
 //! The directional method on rendered boxes with known truth: pose, refusal, tracking.
 
 use nalgebra::{Matrix3, Point3, Unit, UnitQuaternion, Vector3};
-use rand::{Rng, SeedableRng};
+use rand::{RngExt, SeedableRng};
 use vergence_geometry::gaussian::perturb;
 use vergence_geometry::{Camera, GaussianPoint, Transform};
 use vergence_imaging::Image;
@@ -14,7 +14,7 @@ const SIDES: [f64; 3] = [0.10, 0.16, 0.07];
 fn record() -> Record {
     let text = r#"{"object_id": "box", "landmarks": [{"position": [0.05, 0.03, 0.01], "normal": [1, 0, 0]}],
         "bounding_box": {"width": 0.10, "length": 0.16, "height": 0.07}, "shape": {"kind": "box"}}"#;
-    serde_json::from_str(text).unwrap()
+    serde_json::from_str(text).unwrap_or_else(|e| panic!("{e}"))
 }
 
 /// A camera at `eye` that looks at `target`, in base coordinates.
