@@ -84,16 +84,29 @@ impl Sight<'_> {
 }
 
 impl Search<'_> {
-    /// Different poses worth refining, best first.
+    /// Different poses worth refining: those at rest, then the others, each best first. They do not
+    /// compete here: a free attitude always finds edges that explain it a little better.
     pub fn hypotheses(&self) -> Vec<Hypothesis> {
+        let (resting, free) = (self.resting(), self.free());
+        let share = if resting.is_empty() || free.is_empty() { 1 } else { 2 };
+        let mut found = self.best_of(resting, self.config.refined / share, self.query.up);
+        found.extend(self.best_of(free, self.config.refined / share, None));
+        found
+    }
+
+    /// The best of these rotations, each climbed to the top near it; where an axis (base frame) is
+    /// given, by turns about it only.
+    fn best_of(
+        &self,
+        turns: Vec<UnitQuaternion<f64>>,
+        count: usize,
+        about: Option<Unit<Vector3<f64>>>,
+    ) -> Vec<Hypothesis> {
         let mut scratch = Scratch::default();
         // One view ranks all; the others judge only what it leaves.
         let (first, others) = self.sights.split_at(1);
-        let mut found: Vec<Hypothesis> = self
-            .rotations()
-            .into_iter()
-            .filter_map(|turn| self.judge(turn, first, &mut scratch))
-            .collect();
+        let mut found: Vec<Hypothesis> =
+            turns.into_iter().filter_map(|turn| self.judge(turn, first, &mut scratch)).collect();
         if !others.is_empty() {
             let keep = self.config.shortlist.min(found.len());
             if keep < found.len() {
@@ -107,30 +120,33 @@ impl Search<'_> {
         found.sort_by(|a, b| b.evidence.total_cmp(&a.evidence));
         let mut seeds = distinct(&found, self.config.seeds, self.config.grid_spacing);
         for seed in &mut seeds {
-            self.climb(seed, &mut scratch);
+            self.climb(seed, about, &mut scratch);
         }
         seeds.sort_by(|a, b| b.evidence.total_cmp(&a.evidence));
-        distinct(&seeds, self.config.refined, 0.5 * self.config.grid_spacing)
+        distinct(&seeds, count, 0.5 * self.config.grid_spacing)
     }
 
-    /// The rotations to try.
-    fn rotations(&self) -> Vec<UnitQuaternion<f64>> {
+    /// Rotations in which the object rests on something level.
+    fn resting(&self) -> Vec<UnitQuaternion<f64>> {
+        let Some(up) = self.query.up else { return Vec::new() };
+        let downs = match self.query.standing {
+            Some(true) => vec![-Vector3::z()],
+            Some(false) => Vec::new(),
+            None => self.model.resting_directions(),
+        };
         let steps = (std::f64::consts::TAU / self.config.turn_step).round() as usize;
-        let mut turns = Vec::new();
-        if let Some(up) = self.query.up {
-            let downs = match self.query.standing {
-                Some(true) => vec![-Vector3::z()],
-                Some(false) => Vec::new(),
-                None => self.model.resting_directions(),
-            };
-            for down in downs {
-                turns.extend(rotations::standing(up, Unit::new_normalize(down), steps));
+        let around = |down| rotations::standing(up, Unit::new_normalize(down), steps);
+        downs.into_iter().flat_map(around).collect()
+    }
+
+    /// Rotations of an object that may have any attitude.
+    fn free(&self) -> Vec<UnitQuaternion<f64>> {
+        match self.query.standing == Some(true) && self.query.up.is_some() {
+            true => Vec::new(),
+            false => {
+                rotations::spread(rotations::count_for_spacing(self.config.grid_spacing)).collect()
             }
         }
-        if self.query.standing != Some(true) || self.query.up.is_none() {
-            turns.extend(rotations::spread(rotations::count_for_spacing(self.config.grid_spacing)));
-        }
-        turns
     }
 
     /// The pose with the landmark in its place, unless that hides the landmark from a camera.
@@ -174,16 +190,24 @@ impl Search<'_> {
         sum
     }
 
-    /// Turns a hypothesis about the landmark in shrinking steps as long as that helps.
-    fn climb(&self, hypothesis: &mut Hypothesis, scratch: &mut Scratch) {
+    /// Turns a hypothesis about the landmark in shrinking steps as long as that helps: about all
+    /// axes of the object, or about the one given (base frame) so that it stays at rest.
+    fn climb(
+        &self,
+        hypothesis: &mut Hypothesis,
+        about: Option<Unit<Vector3<f64>>>,
+        scratch: &mut Scratch,
+    ) {
         let mut step = 0.5 * self.config.grid_spacing;
         for _ in 0..self.config.climb_halvings {
             for _ in 0..3 {
                 let here = *hypothesis;
-                for axis in [Vector3::x_axis(), Vector3::y_axis(), Vector3::z_axis()] {
-                    for sign in [-1.0, 1.0] {
-                        let turn = here.pose.rotation
-                            * UnitQuaternion::from_axis_angle(&axis, sign * step);
+                let axes = [Vector3::x_axis(), Vector3::y_axis(), Vector3::z_axis()]
+                    .map(|axis| here.pose.rotation * axis);
+                for axis in about.as_ref().map_or(&axes[..], std::slice::from_ref) {
+                    for angle in [-step, step] {
+                        let turn =
+                            UnitQuaternion::from_axis_angle(axis, angle) * here.pose.rotation;
                         if let Some(next) = self.judge(turn, self.sights, scratch)
                             && next.evidence > hypothesis.evidence
                         {
