@@ -1,5 +1,8 @@
 //! The commands as outsiders script against them: JSON, exit status, messages that say what to do.
 
+// Helpers outside of test functions fail a test by panicking, too.
+#![allow(clippy::unwrap_used)]
+
 use std::path::Path;
 use std::process::{Command, Output};
 

@@ -1,6 +1,9 @@
 //! The tag commands against tags in the simulated workcell, and against tags on a Bluetooth
 //! controller behind TCP, which outlive the command.
 
+// Helpers outside of test functions fail a test by panicking, too.
+#![allow(clippy::unwrap_used)]
+
 use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};

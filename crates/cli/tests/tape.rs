@@ -2,6 +2,9 @@
 //! as PNG bytes, radio bytes) is played back with the simulator gone. The same report must come out,
 //! so nothing but pixels, angles and packets can have gone in.
 
+// Helpers outside of test functions fail a test by panicking, too.
+#![allow(clippy::unwrap_used)]
+
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;

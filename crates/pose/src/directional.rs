@@ -130,7 +130,7 @@ pub fn recognise_traced<'a>(
     }
     let search = Search { sights: &sights, model: &model, query, landmark, normal, config };
     let hypotheses = search.hypotheses();
-    let rough = hypotheses.iter().map(|h| search.refine_roughly(&h.pose)).collect();
+    let rough = hypotheses.iter().map(|h| search.refine_roughly(&h.pose, h.rests)).collect();
     let rough = search.ranked(rough, config.distinct);
     let finalists = rough.iter().take(config.finalists);
     let fine = finalists.map(|(rough, _)| search.refine_finely(rough.clone())).collect();
@@ -157,7 +157,7 @@ pub fn track(
         return Err(Refusal::OutOfView);
     }
     let search = Search { sights: &sights, model: &model, query, landmark, normal, config };
-    let (rough, _) = search.refine_roughly(last);
+    let (rough, _) = search.refine_roughly(last, false);
     let found = search.verdict(&[search.refine_finely(rough)])?;
     let turned = query.symmetry().angle_between(&found.pose.pose.rotation, &last.rotation);
     if turned > config.most_turn {
@@ -211,11 +211,11 @@ impl Search<'_> {
     }
 
     /// Refinement at the working scale, wide and coarse: enough to tell which hypothesis is right.
-    fn refine_roughly(&self, start: &Transform) -> (Refined, Explained) {
+    fn refine_roughly(&self, start: &Transform, rests: bool) -> (Refined, Explained) {
         let s = self.scale();
         let passes = [(2.5, 7.0, 4.0), (1.5, 5.0, 4.0), (1.0, 4.0, 3.0)]
             .map(|(sd, range, spacing)| Pass::new(s * sd, s * range, s * spacing, false));
-        let mut refined = Refined::new(start, self.sights.len());
+        let mut refined = Refined::new(start, rests, self.sights.len());
         self.refine(&mut refined, &passes);
         self.weigh(refined, &Pass::new(0.5 * s, 4.0 * s, 3.0 * s, false))
     }

@@ -65,7 +65,7 @@ pub fn deviation(site: &Site, sd_px: f64) -> f64 {
 
 /// What holds against an attitude in which nothing can rest, where gravity is known (nats): objects
 /// in a room stand or lie unless a hand holds them.
-const UNSUPPORTED: f64 = 6.0;
+const UNSUPPORTED: f64 = 40.0;
 
 /// How many independent measurements a site is worth.
 pub fn independent(site: &Site) -> f64 {
@@ -103,6 +103,9 @@ pub struct Refined {
     pub covariance: Matrix6<f64>,
     /// What the priors hold against this state: half their squared normalised residuals.
     pub strain: f64,
+    /// The hypothesis that it comes from rests on something level: it stays so while it is refined,
+    /// or free attitudes would absorb it, which always explain a little more.
+    pub rests: bool,
     /// The sites of the last pass, at the pose before its last step.
     pub sites: Vec<Site>,
 }
@@ -279,7 +282,7 @@ impl Search<'_> {
         let (residual, j) = self.landmark_residual(state);
         let weight = self.landmark_weight();
         let (mut a, mut b) = (j.transpose() * weight * j, j.transpose() * weight * residual);
-        if let Some(turn) = self.tilt(&state.pose) {
+        if let Some(turn) = self.tilt(state) {
             // Only the two turns that tilt the axis are measured, not the one about it.
             let up = self.query.up.map_or(Vector3::z(), |u| u.into_inner());
             let tilts = (Matrix3::identity() - up * up.transpose()) / (STANDING_SD * STANDING_SD);
@@ -301,7 +304,7 @@ impl Search<'_> {
         let weight = self.landmark_weight();
         let landmark = (residual.transpose() * weight * residual).x;
         let size = (state.log_size / SIZE_SD).powi(2);
-        let tilt = match self.tilt(&state.pose) {
+        let tilt = match self.tilt(state) {
             Some(turn) => (turn.norm() / STANDING_SD).powi(2),
             None if self.query.up.is_some() && self.query.standing.is_none() => 2.0 * UNSUPPORTED,
             None => 0.0,
@@ -320,7 +323,7 @@ impl Search<'_> {
     }
 
     /// The small turn (base frame) that would make the object stand exactly, when it seems to.
-    fn tilt(&self, pose: &Transform) -> Option<Vector3<f64>> {
+    fn tilt(&self, state: &Refined) -> Option<Vector3<f64>> {
         let up = self.query.up?.into_inner();
         let downs = match self.query.standing {
             Some(false) => return None,
@@ -329,20 +332,21 @@ impl Search<'_> {
         };
         let nearest = downs
             .into_iter()
-            .map(|down| pose.rotation * -down)
+            .map(|down| state.pose.rotation * -down)
             .max_by(|a, b| a.dot(&up).total_cmp(&b.dot(&up)))?;
         let turn = nearest.cross(&up);
         let stands = nearest.dot(&up) > 0.0
-            && (turn.norm() < STANDING_LIMIT || self.query.standing == Some(true));
+            && (turn.norm() < STANDING_LIMIT || state.rests || self.query.standing == Some(true));
         stands.then_some(turn)
     }
 }
 
 impl Refined {
     /// A pose not yet refined.
-    pub fn new(pose: &Transform, views: usize) -> Self {
+    pub fn new(pose: &Transform, rests: bool, views: usize) -> Self {
         Refined {
             pose: *pose,
+            rests,
             log_size: 0.0,
             nuisances: vec![usual(); views],
             covariance: Matrix6::identity(),

@@ -42,6 +42,8 @@ pub struct Hypothesis {
     pub pose: Transform,
     /// Evidence of the contour in all views (px^2 of the working scale).
     pub evidence: f32,
+    /// The object rests on something level.
+    pub rests: bool,
 }
 
 /// The search's fixed inputs.
@@ -123,7 +125,11 @@ impl Search<'_> {
             self.climb(seed, about, &mut scratch);
         }
         seeds.sort_by(|a, b| b.evidence.total_cmp(&a.evidence));
-        distinct(&seeds, count, 0.5 * self.config.grid_spacing)
+        let mut best = distinct(&seeds, count, 0.5 * self.config.grid_spacing);
+        for hypothesis in &mut best {
+            hypothesis.rests = about.is_some();
+        }
+        best
     }
 
     /// Rotations in which the object rests on something level.
@@ -166,7 +172,7 @@ impl Search<'_> {
         }
         let centre = landmark - turn * self.landmark;
         let pose = Transform::from_parts(centre.coords.into(), turn);
-        Some(Hypothesis { pose, evidence: self.evidence(&pose, sights, scratch) })
+        Some(Hypothesis { pose, evidence: self.evidence(&pose, sights, scratch), rests: false })
     }
 
     fn evidence(&self, pose: &Transform, sights: &[Sight], scratch: &mut Scratch) -> f32 {
