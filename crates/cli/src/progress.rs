@@ -48,7 +48,7 @@ impl Observer for Progress {
             Event::Begun(step) => (*step).to_string(),
             Event::Heard(tags) => format!("{} tags answer", tags.len()),
             Event::Led(LedCommand::Play(pattern)) => format!("the tag blinks {}", pattern.bits),
-            Event::Watched(side, _, seen) if seen.is_empty() => {
+            Event::Watched(side, _, []) => {
                 format!("search: not in this view of the {} head", side.name())
             }
             Event::Watched(side, _, _) => format!("search: seen by the {} head", side.name()),
