@@ -18,6 +18,8 @@ use crate::calibration::{CalibrationConfig, calibrate};
 pub use equation::{EquationError, equation_errors};
 pub use timing::{Timing, time_to_fixation};
 use world::World;
+#[cfg(test)]
+pub(crate) use world::described_head;
 
 /// A servo as a maker describes it.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -297,27 +297,31 @@ impl Servos {
     }
 }
 
-/// The head as described: lever arms of some centimetres, 320x240 pixels, 0.5 m above base.
+/// The heads as described, left and right of the middle.
 pub(super) fn described_heads(baseline: f64) -> [PanTiltHead; 2] {
-    [baseline / 2.0, -baseline / 2.0].map(|y| {
-        let joint = |name: &str, origin: [f64; 3], axis, lower, upper| Joint {
-            name: name.into(),
-            parent_from_joint: Transform::translation(origin[0], origin[1], origin[2]),
-            axis,
-            limits: Limits { lower, upper, velocity: 3.6 },
-        };
-        let chain = Chain {
-            joints: vec![
-                joint("pan", [0.0, y, 0.5], Vector3::z_axis(), -1.8, 1.8),
-                joint("tilt", [0.012, 0.0, 0.04], Vector3::y_axis(), -0.8, 1.2),
-            ],
-            last_from_tip: Transform::from_parts(
-                [0.025, 0.0, 0.015].into(),
-                optical_from_body().inverse(),
-            ),
-        };
-        PanTiltHead { chain, camera: Camera::centred(320, 240, 300.0) }
-    })
+    [baseline / 2.0, -baseline / 2.0].map(described_head)
+}
+
+/// A head as described: lever arms of some centimetres, 320x240 pixels, 0.5 m above base; `y` is the
+/// place of its pan axis in base.
+pub(crate) fn described_head(y: f64) -> PanTiltHead {
+    let joint = |name: &str, origin: [f64; 3], axis, lower, upper| Joint {
+        name: name.into(),
+        parent_from_joint: Transform::translation(origin[0], origin[1], origin[2]),
+        axis,
+        limits: Limits { lower, upper, velocity: 3.6 },
+    };
+    let chain = Chain {
+        joints: vec![
+            joint("pan", [0.0, y, 0.5], Vector3::z_axis(), -1.8, 1.8),
+            joint("tilt", [0.012, 0.0, 0.04], Vector3::y_axis(), -0.8, 1.2),
+        ],
+        last_from_tip: Transform::from_parts(
+            [0.025, 0.0, 0.015].into(),
+            optical_from_body().inverse(),
+        ),
+    };
+    PanTiltHead { chain, camera: Camera::centred(320, 240, 300.0) }
 }
 
 /// A standard normal number (Box-Muller).
