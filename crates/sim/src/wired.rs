@@ -6,8 +6,9 @@
 //! another's; nothing tells it that no metal moves.
 //!
 //! The world's clock is the wall's. Each camera has a thread that waits for its frame's end, renders
-//! what was exposed and shows it; one that cannot keep up drops frames, as cameras do. A camera that
-//! nobody watches is not rendered.
+//! what was exposed and shows it. One that cannot keep up drops frames, those first that were taken while
+//! the head turned: they cost the most and nobody needs them. A camera that nobody watches is not
+//! rendered.
 
 use std::fmt::Write as _;
 use std::io;
@@ -24,13 +25,15 @@ use vergence_devices::dynamixel::{Model, Shaft, Trouble, VirtualBus, VirtualServ
 use vergence_devices::mjpeg::MjpegServer;
 use vergence_imaging::codec;
 
-use crate::camera::Sensor;
+use crate::camera::{Capture, Sensor};
 use crate::workcell::{Truth, Workcell};
 use crate::world::{Shared, lock};
 
 /// Quality of pictures when the settings ask for raw ones: compression then adds less than the noise.
 const QUALITY: u8 = 95;
 const PATHS: [&str; 2] = ["/left", "/right"];
+/// Frames that a camera may be late: half a second at 30 a second.
+const BACKLOG: usize = 16;
 /// Longest sleep of a camera's thread, so that it ends soon when asked to.
 const NAP: Duration = Duration::from_millis(50);
 
@@ -62,6 +65,7 @@ impl WiredWorkcell {
         let cameras = Arc::new(MjpegServer::start(TcpListener::bind(free)?, &PATHS)?);
         let pace = Pace { world: workcell.world().clone(), start: Instant::now() };
         workcell.serve_tags(tag_listener)?;
+        lock(workcell.world()).settings.camera.buffer_frames = BACKLOG;
         let servos = Side::BOTH.into_iter().flat_map(|side| [(side, 0), (side, 1)]);
         let servos = servos.zip(1u8..).map(|((side, joint), id)| {
             VirtualServo::new(id, model, WiredShaft { pace: pace.clone(), side, joint })
@@ -237,8 +241,7 @@ impl Film {
                 next = self.pace.now(|world| world.frame);
                 continue;
             }
-            let capture = self.pace.now(|world| world.captures.back().cloned());
-            let Some(capture) = capture.filter(|c| c.sequence >= next) else {
+            let Some(capture) = self.next_capture(next) else {
                 // The end and the world's clock may differ by a rounding.
                 std::thread::sleep(Duration::from_millis(1));
                 continue;
@@ -251,5 +254,15 @@ impl Film {
                 self.server.show(self.side as usize, jpeg, stamp);
             }
         }
+    }
+    /// The oldest of the frames that show what the newest does, the head at rest; `None` when
+    /// there is nothing new.
+    fn next_capture(&self, next: u64) -> Option<Capture> {
+        self.pace.now(|world| {
+            let side = self.side as usize;
+            let newest = world.captures.back()?.base_from_optical[side];
+            let mut due = world.captures.iter().filter(|c| c.sequence >= next);
+            due.find(|c| c.base_from_optical[side] == newest).cloned()
+        })
     }
 }

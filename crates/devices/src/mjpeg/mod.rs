@@ -37,8 +37,8 @@ const SILENCE: Duration = Duration::from_secs(2);
 const CONNECT: Duration = Duration::from_secs(2);
 /// Wait between attempts to connect.
 const RETRY: Duration = Duration::from_millis(200);
-/// Pictures kept for a reader that is busy for a moment.
-const KEPT: usize = 4;
+/// Pictures kept for a reader that is busy for a moment: half a second at 30 a second.
+const KEPT: usize = 16;
 /// Equal pictures after which the camera counts as frozen: a sensor's noise never repeats.
 const FROZEN: usize = 5;
 

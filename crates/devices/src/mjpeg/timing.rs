@@ -15,8 +15,6 @@ const DELAY_WINDOW: usize = 300;
 /// Steps whose median is the camera's interval, and how many are needed for one.
 const STEPS: usize = 15;
 const FEWEST_STEPS: usize = 4;
-/// A delay that changes by more (s) is the camera's clock being set, not the network.
-const CLOCK_SET: f64 = 1.0;
 /// A gap of more intervals is another run of the camera; its pictures are not counted.
 const LONGEST_GAP: f64 = 1000.0;
 
@@ -43,7 +41,7 @@ impl Timing {
     pub(super) fn place(&mut self, arrival: Duration, camera: Option<f64>) -> (Duration, u64) {
         let mut stamp = camera.map_or(arrival, |camera| self.on_our_clock(arrival, camera));
         if self.stamp.is_some_and(|last| stamp <= last) {
-            // The camera's clock was set back by less than could be told from a slow network.
+            // The camera's clock was set back. (Set ahead, it makes the smallest delay at once.)
             self.forget_clock();
             stamp = camera.map_or(arrival, |camera| self.on_our_clock(arrival, camera));
         }
@@ -56,9 +54,6 @@ impl Timing {
 
     fn on_our_clock(&mut self, arrival: Duration, camera: f64) -> Duration {
         let delay = arrival.as_secs_f64() - camera;
-        if self.delays.back().is_some_and(|last| (delay - last).abs() > CLOCK_SET) {
-            self.delays.clear();
-        }
         self.delays.push_back(delay);
         if self.delays.len() > DELAY_WINDOW {
             self.delays.pop_front();
