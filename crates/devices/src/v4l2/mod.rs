@@ -7,7 +7,8 @@
 //!
 //! Stamps are of the start of exposure if the kernel says so (USB cameras). Stamps of a frame's end
 //! are brought forward by the exposure time; the time that the sensor takes to read out stays in
-//! them. A device that stamps with another clock than the monotonic one is stamped on arrival.
+//! them. Where the stamp is of another clock than the monotonic one, or later than the arrival, the
+//! arrival is the stamp.
 //!
 //! A device that is unplugged is [`Disconnected`](crate::DeviceError::Disconnected) for good and must
 //! be opened again; one whose stream breaks is started again a few times. The kernel is asked

@@ -99,11 +99,11 @@ pub(super) fn lock(
         }
         asked => asked.map(|seconds| (seconds / EXPOSURE_UNIT).round() as i32),
     };
-    let scale = format!("exposure (in {:.0} us)", EXPOSURE_UNIT * 1e6);
-    let in_force = hold(controls, EXPOSURE_ABSOLUTE, &scale, units, &mut locked)?;
+    let in_force =
+        hold(controls, EXPOSURE_ABSOLUTE, ("exposure", " x 100 us"), units, &mut locked)?;
     locked.exposure = in_force
         .and_then(|units| Duration::try_from_secs_f64(f64::from(units) * EXPOSURE_UNIT).ok());
-    locked.gain = hold(controls, GAIN, "gain", gain, &mut locked)?;
+    locked.gain = hold(controls, GAIN, ("gain", ""), gain, &mut locked)?;
     Ok(locked)
 }
 
@@ -111,7 +111,7 @@ pub(super) fn lock(
 fn hold(
     controls: &impl Controls,
     id: u32,
-    name: &str,
+    (name, unit): (&str, &str),
     asked: Option<i32>,
     locked: &mut Locked,
 ) -> std::result::Result<Option<i32>, LockError> {
@@ -128,7 +128,7 @@ fn hold(
         let ControlRange { minimum, maximum, .. } = range;
         if !(minimum..=maximum).contains(&value) {
             return Err(LockError::Unsupported(format!(
-                "{name} {value} is not between {minimum} and {maximum}"
+                "{name} {value}{unit} is not between {minimum} and {maximum}"
             )));
         }
         controls.set(id, value)?;

@@ -221,10 +221,12 @@ impl Reader {
             return arrival;
         }
         let stamp = self.clocks.to_robot(filled.stamp);
-        match filled.flags & sys::STAMP_SOURCE_MASK {
+        let start = match filled.flags & sys::STAMP_SOURCE_MASK {
             sys::STAMP_START_OF_EXPOSURE => stamp,
             _ => stamp.saturating_sub(self.exposure),
-        }
+        };
+        // Nothing is seen before it happens, whatever a device claims.
+        start.min(arrival)
     }
 
     fn restart(&mut self) -> rustix::io::Result<()> {
