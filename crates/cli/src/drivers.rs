@@ -125,7 +125,13 @@ fn camera(
             let opened = Playback::open(camera, folder, clock).ok_or_else(|| table("recording"))?;
             Ok(Box::new(opened.map_err(|error| failed(&error))?))
         }
-        other => Err(unknown("camera", other, "mjpeg, recording")),
+        #[cfg(all(target_os = "linux", target_pointer_width = "64"))]
+        "v4l2" => {
+            let settings = camera.v4l2.as_ref().ok_or_else(|| table("v4l2"))?;
+            let opened = vergence_devices::v4l2::V4l2Camera::open(settings, size, Arc::new(clock));
+            Ok(Box::new(opened.map_err(|error| failed(&error))?))
+        }
+        other => Err(unknown("camera", other, "v4l2 (on 64-bit Linux), mjpeg, recording")),
     }
 }
 

@@ -22,6 +22,21 @@ pub const NOISE_GAIN: f32 = 10.4;
 /// Variance (px^2) of the blob that a point light makes in the filtered image.
 pub const BLOB_VARIANCE: f64 = 2.0 * 0.68 * 0.68;
 
+/// Covariance of the filter output between two pixels that lie `dx` and `dy` (px, up to 3) apart,
+/// relative to its variance, when the noise of the pixels is white.
+pub fn noise_correlation(dx: usize, dy: usize) -> f32 {
+    // Peak with peak, peak with box, box with box: all are products of one dimension each.
+    const PEAK: [f32; 4] = [11.0, 6.0, 1.0, 0.0];
+    const CROSS: [f32; 4] = [5.0, 5.0, 5.0, 4.0];
+    const BOX: [f32; 4] = [7.0, 6.0, 5.0, 4.0];
+    let level = 25.0 / 49.0;
+    let at = |x: usize, y: usize| {
+        let product = |of: &[f32; 4]| of[x.min(3)] * of[y.min(3)];
+        product(&PEAK) - 2.0 * level * product(&CROSS) + level * level * product(&BOX)
+    };
+    at(dx, dy) / at(0, 0)
+}
+
 /// Applies the filter; the border repeats the outermost pixel.
 pub fn filter(image: &Image<u8>) -> Image<i16> {
     let (width, height) = (image.width(), image.height());

@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use nalgebra::Point2;
 use vergence_imaging::Image;
 
-use super::front::GAIN;
+use super::front::{GAIN, noise_correlation};
 use super::motion::Placement;
 use super::shift::weights;
 
@@ -87,6 +87,25 @@ impl History {
         let scale = 1.0 / GAIN;
         out.extend(self.frames.iter().map(|p| f32::from(p.filtered.row(y)[x]) * scale));
     }
+}
+
+/// Noise variance of a series between pixels relative to that on a pixel: interpolation averages
+/// neighbours, whose noise the filter has made alike but not the same.
+pub fn noise_share(place: Point2<f64>) -> f64 {
+    let along = |v: f64| {
+        let w = weights((v - v.floor()) as f32);
+        // Sum of products of weights that lie k pixels apart.
+        let lag = |k: usize| (0..4 - k).map(|i| w[i] * w[i + k]).sum::<f32>();
+        [lag(0), 2.0 * lag(1), 2.0 * lag(2), 2.0 * lag(3)]
+    };
+    let (x, y) = (along(place.x), along(place.y));
+    let mut share = 0.0;
+    for (dy, wy) in y.iter().enumerate() {
+        for (dx, wx) in x.iter().enumerate() {
+            share += wx * wy * noise_correlation(dx, dy);
+        }
+    }
+    f64::from(share)
 }
 
 /// Catmull-Rom interpolation between pixels, clamped to the border.

@@ -17,7 +17,7 @@ use nalgebra::{Matrix2, Point2};
 use super::Config;
 use super::evidence::{Evidence, Series, refine, unexplained, weigh};
 use super::front::{BLOB_VARIANCE, BOX_SHARE};
-use super::history::History;
+use super::history::{History, noise_share};
 use super::nuisance::{Nuisance, dot};
 use super::scan::{BlockNoise, Candidate, MARGIN};
 use super::surroundings::intruders;
@@ -236,7 +236,7 @@ impl Round<'_> {
             }
             place = moved;
             self.history.series(place, &mut raw);
-            let noise = self.noise.at(place.x as usize, place.y as usize);
+            let noise = self.noise.at(place.x as usize, place.y as usize) * noise_share(place);
             series = Series::new(&raw, self.nuisance, series.local, noise);
             let again = weigh(&series, banks.get(request), self.floor(), &mut scratch)?;
             evidence = again;
