@@ -37,10 +37,12 @@ pub fn noise_correlation(dx: usize, dy: usize) -> f32 {
     at(dx, dy) / at(0, 0)
 }
 
-/// Applies the filter; the border repeats the outermost pixel.
-pub fn filter(image: &Image<u8>) -> Image<i16> {
+/// Applies the filter; the border repeats the outermost pixel. `reuse`: a picture whose memory may be
+/// taken when it has the right size.
+pub fn filter(image: &Image<u8>, reuse: Option<Image<i16>>) -> Image<i16> {
     let (width, height) = (image.width(), image.height());
-    let mut out = Image::filled(width, height, 0i16);
+    let fits = |old: &Image<i16>| (old.width(), old.height()) == (width, height);
+    let mut out = reuse.filter(fits).unwrap_or_else(|| Image::filled(width, height, 0i16));
     let row = |y: i64| image.row(y.clamp(0, height as i64 - 1) as usize);
     let padded = width + 2 * REACH;
     let (mut three, mut seven) = (vec![0u16; padded], vec![0u16; padded]);
@@ -163,7 +165,7 @@ mod tests {
         };
         let image =
             Image::from_fn(40, 30, |x, y| (50.0 + 2.0 * x as f64 + y as f64 + light(x, y)) as u8);
-        let filtered = filter(&image);
+        let filtered = filter(&image, None);
         let peak = f32::from(filtered.row(15)[20]) / GAIN;
         assert!((peak - 40.0).abs() < 1.0, "{peak}");
         let flat = f32::from(filtered.row(8)[9]) / GAIN;
@@ -175,7 +177,7 @@ mod tests {
         let image = Image::from_fn(33, 21, |x, y| (x * 37 + y * 91 + x * y) as u8);
         let at =
             |x: i64, y: i64| i64::from(image.row(y.clamp(0, 20) as usize)[x.clamp(0, 32) as usize]);
-        let filtered = filter(&image);
+        let filtered = filter(&image, None);
         for y in 0..21i64 {
             for x in 0..33i64 {
                 let taps = [1, 3, 1];
