@@ -97,6 +97,11 @@ impl Ears {
         self.public.borrow().contains(&tag)
     }
 
+    /// The tag holds another record now: what it claimed to be no longer counts.
+    pub fn rewritten(&self, tag: TagAddress) {
+        self.claims.borrow_mut().remove(&tag);
+    }
+
     /// What the tag claims to be.
     pub fn object_id(&self, tag: TagAddress) -> Option<Claim> {
         self.claims.borrow().get(&tag).cloned()
