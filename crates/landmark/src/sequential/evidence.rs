@@ -13,11 +13,17 @@ use vergence_tag::Pattern;
 use super::nuisance::{Nuisance, dot};
 use super::template::{Bank, Hypothesis, light};
 
-/// Weight of the neighbourhood's noise against the pixel's own, in frames.
-const NOISE_FRAMES: f64 = 200.0;
+/// Weight of the neighbourhood's noise against the place's own, in frames: a block holds about 23
+/// independent places, so after 40 frames it knows its noise this well.
+const NOISE_FRAMES: f64 = 1000.0;
 
-/// Widths of the amplitude priors, in noise standard deviations.
-const WIDTHS: [f64; 3] = [2.0, 8.0, 32.0];
+/// Widths of the amplitude priors, in noise standard deviations, and their weights. A strong light is
+/// decided within frames whatever its prior; most of the weight goes where it saves frames.
+const WIDTHS: [(f64, f64); 3] = [(2.0, 0.8), (8.0, 0.15), (32.0, 0.05)];
+
+/// Standard deviations by which a place must be noisier than its neighbourhood to have noise of its
+/// own: less is chance, and taking the larger of the two every time would only cost frames.
+const OWN_NOISE: f64 = 1.5;
 
 /// A deviation this many times the ninth decile of all deviations is cut to it: something passed.
 const CLIP: f32 = 3.0;
@@ -76,10 +82,12 @@ impl Series {
     }
 
     /// Energy with the prior's share added. A place that stays noisier than its neighbourhood once
-    /// the best light is taken out has noise of its own.
+    /// the best light is taken out, by more than chance explains, has noise of its own.
     fn total(&self, explained: f64) -> f64 {
         let own = (self.energy - explained).max(0.0) / self.freedom;
-        self.energy + NOISE_FRAMES * self.noise.max(own)
+        let chance = 1.0 + OWN_NOISE * (2.0 / self.freedom).sqrt();
+        let own = if own > chance * self.noise { own } else { self.noise };
+        self.energy + NOISE_FRAMES * own
     }
 }
 
@@ -172,13 +180,13 @@ fn log_ratio(freedom: f64, total: f64, correlation: f64, norm2: f64) -> f64 {
     }
     let explained = (correlation * correlation / total).min(0.999_999);
     let half = 0.5 * (freedom + NOISE_FRAMES);
-    let term = |width: &f64| {
+    let term = |(width, weight): (f64, f64)| {
         let gain = width * width * norm2;
-        -0.5 * (1.0 + gain).ln() - half * (-explained * gain / (1.0 + gain)).ln_1p()
+        weight.ln() - 0.5 * (1.0 + gain).ln() - half * (-explained * gain / (1.0 + gain)).ln_1p()
     };
-    let terms = WIDTHS.map(|w| term(&w));
+    let terms = WIDTHS.map(term);
     let largest = terms.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    let mean = terms.iter().map(|t| (t - largest).exp()).sum::<f64>() / WIDTHS.len() as f64;
+    let mean = terms.iter().map(|t| (t - largest).exp()).sum::<f64>();
     // Half-normal: the amplitude is positive, so the prior is twice as dense there.
     largest + mean.ln() + std::f64::consts::LN_2
 }
