@@ -6,7 +6,7 @@
 #     scripts/qemu_bluez.sh
 #
 # Needs Debian (or a relative with the package linux-image-amd64); as root it installs what is
-# missing, else it says what is. About a minute, five at most. Skips with a message where it cannot run.
+# missing, else it says what is. About a minute, four at most, and what the build takes. Skips with a message where it cannot run.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 . scripts/qemu_guest.sh
@@ -28,7 +28,7 @@ trap 'kill $server; rm -f "$tags"' EXIT
 until grep -q 'tags on' "$tags"; do sleep 0.1; done
 port=$(sed -n 's/tags on .*:\([0-9]*\)$/\1/p' "$tags")
 
-guest_run "$guest/bluez" 240 -chardev "socket,id=hci,host=127.0.0.1,port=$port,nodelay=on" \
+guest_run "$guest/bluez" 220 -chardev "socket,id=hci,host=127.0.0.1,port=$port,nodelay=on" \
   -serial chardev:hci <<'INIT'
 # The kernel pairs with these. The order matters: each tests itself with those before it.
 for module in hmac sha512_generic ctr ecb cmac jitterentropy_rng drbg ecdh_generic algif_hash \

@@ -41,7 +41,9 @@ impl Nuisance {
             nuisance.add(history.frames().iter().map(|p| p.placement.dy as f32).collect());
         }
         for strengths in &lamps.strengths {
-            nuisance.add(history.frames().iter().map(|p| dot(&p.placement.row_gain, strengths)).collect());
+            nuisance.add(
+                history.frames().iter().map(|p| dot(&p.placement.row_gain, strengths)).collect(),
+            );
         }
         nuisance
     }

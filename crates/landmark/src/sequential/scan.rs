@@ -245,9 +245,6 @@ fn peaks(energy: &[f32], width: usize, y: usize, limits: &[f32], columns: &mut V
     let inside: Range<usize> = MARGIN..width - MARGIN;
     columns.extend(inside.filter(|&x| {
         let e = here[x];
-        e > limits[x]
-            && e >= here[x - 1]
-            && e > here[x + 1]
-            && is_peak([above, here, below], x)
+        e > limits[x] && e >= here[x - 1] && e > here[x + 1] && is_peak([above, here, below], x)
     }));
 }

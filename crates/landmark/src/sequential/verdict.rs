@@ -112,11 +112,7 @@ impl Banks {
 }
 
 /// The bank of a slot, brought up to the window of this round.
-fn fitted<'a>(
-    slot: &'a mut Option<Bank>,
-    round: &Round,
-    new: impl FnOnce() -> Bank,
-) -> &'a Bank {
+fn fitted<'a>(slot: &'a mut Option<Bank>, round: &Round, new: impl FnOnce() -> Bank) -> &'a Bank {
     let bank = slot.get_or_insert_with(new);
     bank.fit(round.history.times(), round.history.numbers(), round.nuisance);
     bank
@@ -320,7 +316,8 @@ impl Round<'_> {
             }
         }
         for _ in 0..2 {
-            evidence = refine(&series, pattern, self.history.times(), self.nuisance, evidence, step);
+            evidence =
+                refine(&series, pattern, self.history.times(), self.nuisance, evidence, step);
             let best = (evidence.best.phase, evidence.best.rate);
             series.expect(pattern, self.history.times(), best, self.nuisance, &mut expected);
             let moved = self.peak(place, &expected, &mut raw);
