@@ -5,7 +5,9 @@
 //! (the output says why), 2 for misuse.
 
 mod commands;
+mod drivers;
 mod failure;
+mod interrupt;
 mod output;
 mod progress;
 mod radio;

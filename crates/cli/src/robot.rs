@@ -5,15 +5,13 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use vergence::System;
 use vergence::report::{Report, TruthReport, numbers};
-use vergence_devices::{Config, Description, Robot, Side};
+use vergence_devices::{Config, Description, Robot};
 use vergence_geometry::Transform;
-use vergence_sim::{Scenario, Workcell};
+use vergence_sim::{Scenario, SimConfig, Workcell};
 
+use crate::drivers::{self, HCI, SIM};
 use crate::failure::Failure;
 use crate::radio::{self, Radio};
-
-/// The radio driver for Bluetooth controllers.
-const HCI: &str = "hci";
 
 /// Which robot.
 #[derive(Args, Clone, Default)]
@@ -52,7 +50,11 @@ impl RobotArgs {
         match &self.config {
             Some(path) => {
                 let (config, description) = read(path)?;
-                check_drivers(&config)?;
+                check_radio(&config)?;
+                if !drivers::simulated(&config)? {
+                    let devices = drivers::open(&config, &description, folder(path))?;
+                    return Opened::wired(config, description, devices);
+                }
                 let workcell = Workcell::from_config(&config, &description, self.seed);
                 let workcell = workcell.map_err(unusable)?;
                 let mut devices = workcell.robot();
@@ -65,12 +67,22 @@ impl RobotArgs {
         }
     }
 
+    /// What a simulated workcell is made of: the configuration's, else the embedded one's.
+    pub fn simulation(&self) -> Result<(Config, Description, SimConfig), Failure> {
+        let (config, description) = match &self.config {
+            Some(path) => read(path)?,
+            None => vergence_sim::embedded_files().map_err(unusable)?,
+        };
+        let settings = vergence_sim::settings(&config).map_err(unusable)?;
+        Ok((config, description, settings))
+    }
+
     /// Opens the tag radio alone.
     pub fn open_radio(&self) -> Result<Radio, Failure> {
         let workcell = match &self.config {
             Some(path) => {
                 let (config, description) = read(path)?;
-                check_drivers(&config)?;
+                check_radio(&config)?;
                 if config.radio.driver == HCI {
                     return radio::open(&config, folder(path));
                 }
@@ -88,6 +100,12 @@ impl Opened {
         let workcell = Workcell::embedded_as(scenario, seed).map_err(unusable)?;
         let devices = workcell.robot();
         Self::new(workcell, devices)
+    }
+
+    /// A robot whose devices are not the simulator's.
+    fn wired(config: Config, description: Description, devices: Robot) -> Result<Self, Failure> {
+        let system = System::new(devices, &config, &description).map_err(unusable)?;
+        Ok(Opened { system, config, description, workcell: None })
     }
 
     fn new(workcell: Workcell, devices: Robot) -> Result<Self, Failure> {
@@ -141,23 +159,15 @@ fn folder(path: &Path) -> &Path {
     path.parent().unwrap_or(Path::new(""))
 }
 
-/// Refuses drivers that do not exist.
-fn check_drivers(config: &Config) -> Result<(), Failure> {
-    let heads = Side::BOTH.map(|side| config.head(side));
-    let radio = &config.radio.driver;
-    let named = heads
-        .iter()
-        .flat_map(|head| [&head.camera.driver, &head.servos.driver])
-        .chain(Some(radio).filter(|driver| *driver != HCI));
-    match named.into_iter().find(|driver| *driver != "sim") {
-        None => Ok(()),
-        Some(driver) => Err(Failure::misuse(
-            format!("there is no driver \"{driver}\""),
-            "drivers are: sim (the simulated workcell) for all devices, hci for the radio too",
-        )),
+/// Refuses a radio driver that does not exist.
+fn check_radio(config: &Config) -> Result<(), Failure> {
+    match config.radio.driver.as_str() {
+        SIM | HCI => Ok(()),
+        other => Err(drivers::unknown("radio", other, HCI)),
     }
 }
 
-fn unusable(error: impl std::fmt::Display) -> Failure {
+/// A configuration that cannot be used.
+pub fn unusable(error: impl std::fmt::Display) -> Failure {
     Failure::misuse(error, "compare with the workcell that is built in: `vergence workcell DIR`")
 }
