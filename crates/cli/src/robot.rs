@@ -1,14 +1,16 @@
 //! Opens the robot that a command works with: the configured devices, or the simulated workcell.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use clap::Args;
 use vergence::System;
-use vergence::report::{Report, TruthReport, numbers};
+use vergence::report::{PhysicsReport, Report, TruthReport, numbers};
 use vergence_devices::{Config, Description, Robot, Side};
 use vergence_geometry::Transform;
 use vergence_sim::{Scenario, Workcell};
 
+use crate::bench::{self, SharedBench};
 use crate::failure::Failure;
 use crate::radio::{self, Radio};
 
@@ -35,7 +37,9 @@ pub struct Opened {
     /// URDF.
     pub description: Description,
     /// The simulator, when it serves the devices.
-    workcell: Option<Workcell>,
+    workcell: Option<Arc<Workcell>>,
+    /// The contacts of the simulated arm, when it is attached.
+    bench: Option<SharedBench>,
 }
 
 /// How far a reported pose is from the simulator's truth.
@@ -93,7 +97,25 @@ impl Opened {
     fn new(workcell: Workcell, devices: Robot) -> Result<Self, Failure> {
         let (config, description) = (workcell.config().clone(), workcell.description().clone());
         let system = System::new(devices, &config, &description).map_err(unusable)?;
-        Ok(Opened { system, config, description, workcell: Some(workcell) })
+        let workcell = Some(Arc::new(workcell));
+        Ok(Opened { system, config, description, workcell, bench: None })
+    }
+
+    /// Gives the robot its arm, when it has one: contacts are simulated around one object.
+    pub fn attach_arm(&mut self, object: &str) -> Result<(), Failure> {
+        let (Some(workcell), Some(_)) = (&self.workcell, &self.config.arm) else { return Ok(()) };
+        let clock = workcell.robot().clock;
+        if let Some((arm, bench)) = bench::build(workcell, &self.description, object, clock)? {
+            self.system.robot.arm = Some(Box::new(arm));
+            self.system.hand = Some(bench::hand(&self.description)?);
+            self.bench = Some(bench);
+        }
+        Ok(())
+    }
+
+    /// The physics' verdict on what the arm did, in simulation.
+    pub fn physics(&self) -> Option<PhysicsReport> {
+        self.bench.as_ref().map(|bench| bench::lock(bench).verdict())
     }
 
     /// The simulator's truth of an object.
@@ -148,7 +170,8 @@ fn check_drivers(config: &Config) -> Result<(), Failure> {
     let named = heads
         .iter()
         .flat_map(|head| [&head.camera.driver, &head.servos.driver])
-        .chain(Some(radio).filter(|driver| *driver != HCI));
+        .chain(Some(radio).filter(|driver| *driver != HCI))
+        .chain(config.arm.iter().map(|arm| &arm.driver));
     match named.into_iter().find(|driver| *driver != "sim") {
         None => Ok(()),
         Some(driver) => Err(Failure::misuse(
