@@ -24,7 +24,7 @@ const LONGEST_WATCH: Duration = Duration::from_secs(6);
 
 impl Run<'_> {
     /// Chooses the pattern and has the tag play it.
-    pub(super) fn start_blinking(&mut self, tag: TagAddress) -> Result<Pattern, Stop> {
+    pub(crate) fn start_blinking(&mut self, tag: TagAddress) -> Result<Pattern, Stop> {
         let interval = self.frame_interval()?;
         let rate = 1.0 / interval.as_secs_f64().max(1e-3);
         let pattern = match self.config.method {

@@ -1,6 +1,7 @@
 //! Steps 2 and 3 of the paper: the light is brought to the centre of both pictures, and the joint
 //! angles give its place.
 
+use nalgebra::Point3;
 use vergence_devices::{JointReading, Side};
 use vergence_geometry::GaussianPoint;
 use vergence_head::{
@@ -11,7 +12,7 @@ use vergence_landmark::Sighting;
 use vergence_tag::Pattern;
 
 use super::search::Seen;
-use super::{Run, Stop};
+use super::{Missing, Run, Stop};
 use crate::event::Event;
 use crate::report::LandmarkReport;
 
@@ -56,6 +57,35 @@ impl Run<'_> {
             self.observer.notice(&Event::Centred(*side, *joints, sighting));
         }
         Ok(held.map(|(joints, sighting)| fixation(&joints, &sighting)))
+    }
+
+    /// Looks at a place where the light should be, centres it and measures where it is; gives the
+    /// heads' angles too.
+    pub(crate) fn locate_near(
+        &mut self,
+        pattern: &Pattern,
+        near: &Point3<f64>,
+    ) -> Result<(GaussianPoint, [[f64; 2]; 2]), Stop> {
+        let targets = [0, 1].map(|k| self.system.heads[k].look_at(near));
+        let joints = self.system.turn(targets)?;
+        let sightings = self.watch(pattern, joints.map(Some))?;
+        let missing = [0, 1].map(|k| sightings[k].is_empty());
+        if missing != [false, false] {
+            let missing = match missing {
+                [true, true] => Missing::Either,
+                [true, false] => Missing::One(Side::Left),
+                _ => Missing::One(Side::Right),
+            };
+            return Err(Stop::NotSeen { views: 2, missing });
+        }
+        let [left, right] = sightings;
+        let seen = [
+            Seen { joints: joints[0], sightings: left },
+            Seen { joints: joints[1], sightings: right },
+        ];
+        let held = self.centre(pattern, seen)?;
+        let landmark = self.triangulate(&held)?;
+        Ok((landmark, held.map(|fixation| fixation.angles)))
     }
 
     /// Of all places that either head saw, the pair that can be one light: the brightest whose lines
