@@ -1,14 +1,16 @@
 //! Opens the robot that a command works with: the configured devices, or the simulated workcell.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use clap::Args;
 use vergence::System;
-use vergence::report::{Report, TruthReport, numbers};
+use vergence::report::{PhysicsReport, Report, TruthReport, numbers};
 use vergence_devices::{Config, Description, Robot};
 use vergence_geometry::Transform;
 use vergence_sim::{Scenario, SimConfig, Workcell};
 
+use crate::bench::{self, SharedBench};
 use crate::drivers::{self, HCI, SIM};
 use crate::failure::Failure;
 use crate::radio::{self, Radio};
@@ -33,7 +35,9 @@ pub struct Opened {
     /// URDF.
     pub description: Description,
     /// The simulator, when it serves the devices.
-    workcell: Option<Workcell>,
+    workcell: Option<Arc<Workcell>>,
+    /// The contacts of the simulated arm, when it is attached.
+    bench: Option<SharedBench>,
 }
 
 /// How far a reported pose is from the simulator's truth.
@@ -50,7 +54,7 @@ impl RobotArgs {
         match &self.config {
             Some(path) => {
                 let (config, description) = read(path)?;
-                check_radio(&config)?;
+                check_drivers(&config)?;
                 if !drivers::simulated(&config)? {
                     let devices = drivers::open(&config, &description, folder(path))?;
                     return Opened::wired(config, description, devices);
@@ -82,7 +86,7 @@ impl RobotArgs {
         let workcell = match &self.config {
             Some(path) => {
                 let (config, description) = read(path)?;
-                check_radio(&config)?;
+                check_drivers(&config)?;
                 if config.radio.driver == HCI {
                     return radio::open(&config, folder(path));
                 }
@@ -105,13 +109,31 @@ impl Opened {
     /// A robot whose devices are not the simulator's.
     fn wired(config: Config, description: Description, devices: Robot) -> Result<Self, Failure> {
         let system = System::new(devices, &config, &description).map_err(unusable)?;
-        Ok(Opened { system, config, description, workcell: None })
+        Ok(Opened { system, config, description, workcell: None, bench: None })
     }
 
     fn new(workcell: Workcell, devices: Robot) -> Result<Self, Failure> {
         let (config, description) = (workcell.config().clone(), workcell.description().clone());
         let system = System::new(devices, &config, &description).map_err(unusable)?;
-        Ok(Opened { system, config, description, workcell: Some(workcell) })
+        let workcell = Some(Arc::new(workcell));
+        Ok(Opened { system, config, description, workcell, bench: None })
+    }
+
+    /// Gives the robot its arm, when it has one: contacts are simulated around one object.
+    pub fn attach_arm(&mut self, object: &str) -> Result<(), Failure> {
+        let (Some(workcell), Some(_)) = (&self.workcell, &self.config.arm) else { return Ok(()) };
+        let clock = workcell.robot().clock;
+        if let Some((arm, bench)) = bench::build(workcell, &self.description, object, clock)? {
+            self.system.robot.arm = Some(Box::new(arm));
+            self.system.hand = Some(bench::hand(&self.description)?);
+            self.bench = Some(bench);
+        }
+        Ok(())
+    }
+
+    /// The physics' verdict on what the arm did, in simulation.
+    pub fn physics(&self) -> Option<PhysicsReport> {
+        self.bench.as_ref().map(|bench| bench::lock(bench).verdict())
     }
 
     /// The simulator's truth of an object.
@@ -159,11 +181,15 @@ fn folder(path: &Path) -> &Path {
     path.parent().unwrap_or(Path::new(""))
 }
 
-/// Refuses a radio driver that does not exist.
-fn check_radio(config: &Config) -> Result<(), Failure> {
+/// Refuses drivers of radio and arm that do not exist.
+fn check_drivers(config: &Config) -> Result<(), Failure> {
     match config.radio.driver.as_str() {
-        SIM | HCI => Ok(()),
-        other => Err(drivers::unknown("radio", other, HCI)),
+        SIM | HCI => {}
+        other => return Err(drivers::unknown("radio", other, HCI)),
+    }
+    match &config.arm {
+        Some(arm) if arm.driver != SIM => Err(drivers::unknown("arm", &arm.driver, "no other")),
+        _ => Ok(()),
     }
 }
 

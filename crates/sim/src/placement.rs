@@ -4,6 +4,8 @@
 //! the heads and is in line of sight of both; at the heads' rest it is outside both pictures; in the
 //! scenario "occluded" something hides a part of the cup but not its landmark.
 
+use std::ops::Range;
+
 use nalgebra::{Point3, Translation3, Unit, UnitQuaternion, Vector3};
 use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
@@ -62,6 +64,10 @@ pub struct Composition {
     pub scene: Scene,
     /// Tagged objects in the order of the configuration.
     pub objects: Vec<TaggedObject>,
+    /// Which bodies of the scene belong to each of them.
+    pub bodies_of: Vec<Range<usize>>,
+    /// Untagged things on the table with their places.
+    pub clutter: Vec<(Transform, Solid)>,
     /// A status light that blinks by itself.
     pub status: Option<Emitter>,
 }
@@ -95,10 +101,13 @@ fn compose_once(
         views: *views,
         eyes: views.map(|v| Point3::from(v.base_from_optical.translation.vector)),
         housing: config.led.housing,
+        clutter: Vec::new(),
     };
-    let mut objects = Vec::new();
+    let (mut objects, mut bodies_of) = (Vec::new(), Vec::new());
     for settings in &config.objects {
+        let first = builder.scene.bodies.len();
         objects.push(builder.place_object(settings, &mut rng)?);
+        bodies_of.push(first..builder.scene.bodies.len());
     }
     // A later object may stand before an earlier one's light: then the arrangement is drawn anew.
     for (object, _) in objects.iter().zip(&config.objects).filter(|(_, s)| s.at.is_none()) {
@@ -126,7 +135,8 @@ fn compose_once(
     for _ in 0..config.clutter {
         builder.add_clutter(&objects, &mut rng);
     }
-    Ok(Composition { scene: builder.scene, objects, status })
+    let Builder { scene, clutter, .. } = builder;
+    Ok(Composition { scene, objects, bodies_of, clutter, status })
 }
 
 /// Bodies of a tagged object and of the housing of its tag.
@@ -286,6 +296,8 @@ struct Builder {
     views: [RestView; 2],
     eyes: [Point3<f64>; 2],
     housing: bool,
+    /// Untagged things with their places.
+    clutter: Vec<(Transform, Solid)>,
 }
 
 impl Builder {
@@ -443,6 +455,7 @@ impl Builder {
             let share = self.hidden_share(target, &body.placed);
             let partly = share.iter().all(|s| (0.15..0.5).contains(s));
             if partly && self.try_add(body, objects, |_| true) {
+                self.clutter.push((place, solid));
                 self.taken.push([x, y, radius]);
                 return Ok(());
             }
@@ -468,9 +481,11 @@ impl Builder {
                 UnitQuaternion::from_euler_angles(0.0, 0.0, yaw),
             );
             let surface = Material::matt(0.09, Texture::Plain, 5).glossy(0.04);
-            let body = Body::new(Solid::Box(half.map(|h| h as f32)), &place, surface);
+            let solid = Solid::Box(half.map(|h| h as f32));
+            let body = Body::new(solid, &place, surface);
             let clear_of = |builder: &Self| builder.hides_little(objects);
             if self.try_add(body, objects, clear_of) {
+                self.clutter.push((place, solid));
                 self.taken.push([x, y, 0.095]);
                 let position = place * Point3::new(half[0] + 0.001, 0.04, 0.004);
                 let normal = Unit::new_normalize(place.rotation * Vector3::x());
@@ -504,6 +519,7 @@ impl Builder {
                 [rng.random_range(0..4)];
             let body = Body::new(solid, &place, material(kind, &solid, rng));
             if self.try_add(body, objects, |builder| builder.hides_little(objects)) {
+                self.clutter.push((place, solid));
                 self.taken.push([x, y, radius]);
                 return;
             }

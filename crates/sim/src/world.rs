@@ -6,6 +6,7 @@
 //! reads which camera when.
 
 use std::collections::VecDeque;
+use std::ops::Range;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -16,7 +17,7 @@ use crate::config::SimConfig;
 use crate::placement::TaggedObject;
 use crate::radio::{self, Radio};
 use crate::servo::Servo;
-use crate::trace::Stage;
+use crate::trace::{Solid, Stage};
 
 /// A head as it really is.
 #[derive(Debug, Clone)]
@@ -69,6 +70,10 @@ pub struct World {
     pub(crate) settings: SimConfig,
     pub(crate) heads: [TrueHead; 2],
     pub(crate) objects: Vec<TaggedObject>,
+    /// Which bodies of the scene belong to each object.
+    pub(crate) bodies_of: Vec<Range<usize>>,
+    /// Untagged things on the table.
+    pub(crate) clutter: Vec<(Transform, Solid)>,
     pub(crate) radio: Radio,
     pub(crate) status: Option<Blinker>,
     pub(crate) stage: Arc<Stage>,
@@ -121,6 +126,23 @@ impl World {
         }
         self.move_servos(until);
         self.now = self.now.max(time);
+    }
+
+    /// Moves a tagged object with all its bodies; frames that are complete keep what they saw.
+    pub fn place_object(&mut self, id: &str, base_from_object: &Transform) -> bool {
+        let Some(index) = self.objects.iter().position(|o| o.record.object_id.as_str() == id)
+        else {
+            return false;
+        };
+        let object = &mut self.objects[index];
+        let motion = base_from_object * object.base_from_object.inverse();
+        object.base_from_object = *base_from_object;
+        let mut scene = self.stage.scene.clone();
+        for body in scene.bodies.get_mut(self.bodies_of[index].clone()).into_iter().flatten() {
+            body.placed = body.placed.moved(&motion);
+        }
+        self.stage = Arc::new(Stage::new(scene));
+        true
     }
 
     fn move_servos(&mut self, time: f64) {

@@ -5,6 +5,7 @@ mod blink;
 mod evaluate;
 mod experiment;
 mod find;
+mod grasp;
 mod pose;
 mod sim;
 mod tag;
@@ -20,6 +21,8 @@ use crate::failure::Failure;
 pub enum Command {
     /// Find an object and recognise its pose.
     Find(find::Find),
+    /// Find an object, grasp it and lift it.
+    Grasp(grasp::Grasp),
     /// List the tags in radio range with their records.
     Tags(tags::Tags),
     /// Work on one tag: write its record, blink its light, pair with it, ask what it is.
@@ -42,6 +45,7 @@ pub enum Command {
 pub fn run(command: Command) -> Result<bool, Failure> {
     match command {
         Command::Find(args) => find::run(&args),
+        Command::Grasp(args) => grasp::run(&args),
         Command::Tags(args) => tags::run(&args),
         Command::Tag(args) => tag::run(&args),
         Command::Experiment(args) => experiment::run(&args),
