@@ -11,7 +11,7 @@ use vergence_geometry::Transform;
 use vergence_sim::{Scenario, SimConfig, Workcell};
 
 use crate::bench::{self, SharedBench};
-use crate::drivers::{self, HCI, SIM};
+use crate::drivers::{self, BLUEZ, HCI, SIM};
 use crate::failure::Failure;
 use crate::radio::{self, Radio};
 
@@ -62,8 +62,8 @@ impl RobotArgs {
                 let workcell = Workcell::from_config(&config, &description, self.seed);
                 let workcell = workcell.map_err(unusable)?;
                 let mut devices = workcell.robot();
-                if config.radio.driver == HCI {
-                    devices.radio = Box::new(radio::open(&config, folder(path))?.link);
+                if config.radio.driver != SIM {
+                    devices.radio = radio::open(&config, folder(path))?.link;
                 }
                 Opened::new(workcell, devices)
             }
@@ -87,7 +87,7 @@ impl RobotArgs {
             Some(path) => {
                 let (config, description) = read(path)?;
                 check_drivers(&config)?;
-                if config.radio.driver == HCI {
+                if config.radio.driver != SIM {
                     return radio::open(&config, folder(path));
                 }
                 Workcell::from_config(&config, &description, self.seed)
@@ -184,8 +184,8 @@ fn folder(path: &Path) -> &Path {
 /// Refuses drivers of radio and arm that do not exist.
 fn check_drivers(config: &Config) -> Result<(), Failure> {
     match config.radio.driver.as_str() {
-        SIM | HCI => {}
-        other => return Err(drivers::unknown("radio", other, HCI)),
+        SIM | HCI | BLUEZ => {}
+        other => return Err(drivers::unknown("radio", other, "hci, bluez")),
     }
     match &config.arm {
         Some(arm) if arm.driver != SIM => Err(drivers::unknown("arm", &arm.driver, "no other")),

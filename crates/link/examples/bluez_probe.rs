@@ -10,7 +10,6 @@
 use std::error::Error;
 use std::time::{Duration, Instant};
 
-use vergence_air::StreamTransport;
 use vergence_devices::{DeviceError, LedCommand, TagAddress};
 use vergence_link::{BluezLink, HciLink, LinkConfig, TagRadio};
 use vergence_tag::{Pattern, cbor, pattern::Bits};
@@ -31,9 +30,7 @@ const TIMEOUT: Duration = Duration::from_secs(10);
 fn main() -> Result<(), Box<dyn Error>> {
     let mut link: Box<dyn TagRadio> = match std::env::args().nth(1).as_deref() {
         Some("bluez") => Box::new(BluezLink::open(None)?),
-        Some("hci0") => {
-            Box::new(HciLink::open(|| StreamTransport::user_channel(0), LinkConfig::default())?)
-        }
+        Some("hci0") => Box::new(HciLink::linux(0, LinkConfig::default())?),
         _ => return Err("bluez_probe bluez|hci0".into()),
     };
     let mut failed = 0;
