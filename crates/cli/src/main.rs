@@ -6,7 +6,9 @@
 
 mod bench;
 mod commands;
+mod drivers;
 mod failure;
+mod interrupt;
 mod output;
 mod progress;
 mod radio;

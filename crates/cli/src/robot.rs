@@ -6,16 +6,14 @@ use std::sync::Arc;
 use clap::Args;
 use vergence::System;
 use vergence::report::{PhysicsReport, Report, TruthReport, numbers};
-use vergence_devices::{Config, Description, Robot, Side};
+use vergence_devices::{Config, Description, Robot};
 use vergence_geometry::Transform;
-use vergence_sim::{Scenario, Workcell};
+use vergence_sim::{Scenario, SimConfig, Workcell};
 
 use crate::bench::{self, SharedBench};
+use crate::drivers::{self, HCI, SIM};
 use crate::failure::Failure;
 use crate::radio::{self, Radio};
-
-/// The radio driver for Bluetooth controllers.
-const HCI: &str = "hci";
 
 /// Which robot.
 #[derive(Args, Clone, Default)]
@@ -57,6 +55,10 @@ impl RobotArgs {
             Some(path) => {
                 let (config, description) = read(path)?;
                 check_drivers(&config)?;
+                if !drivers::simulated(&config)? {
+                    let devices = drivers::open(&config, &description, folder(path))?;
+                    return Opened::wired(config, description, devices);
+                }
                 let workcell = Workcell::from_config(&config, &description, self.seed);
                 let workcell = workcell.map_err(unusable)?;
                 let mut devices = workcell.robot();
@@ -67,6 +69,16 @@ impl RobotArgs {
             }
             None => Opened::embedded(self.seed, Scenario::Default),
         }
+    }
+
+    /// What a simulated workcell is made of: the configuration's, else the embedded one's.
+    pub fn simulation(&self) -> Result<(Config, Description, SimConfig), Failure> {
+        let (config, description) = match &self.config {
+            Some(path) => read(path)?,
+            None => vergence_sim::embedded_files().map_err(unusable)?,
+        };
+        let settings = vergence_sim::settings(&config).map_err(unusable)?;
+        Ok((config, description, settings))
     }
 
     /// Opens the tag radio alone.
@@ -92,6 +104,12 @@ impl Opened {
         let workcell = Workcell::embedded_as(scenario, seed).map_err(unusable)?;
         let devices = workcell.robot();
         Self::new(workcell, devices)
+    }
+
+    /// A robot whose devices are not the simulator's.
+    fn wired(config: Config, description: Description, devices: Robot) -> Result<Self, Failure> {
+        let system = System::new(devices, &config, &description).map_err(unusable)?;
+        Ok(Opened { system, config, description, workcell: None, bench: None })
     }
 
     fn new(workcell: Workcell, devices: Robot) -> Result<Self, Failure> {
@@ -163,24 +181,19 @@ fn folder(path: &Path) -> &Path {
     path.parent().unwrap_or(Path::new(""))
 }
 
-/// Refuses drivers that do not exist.
+/// Refuses drivers of radio and arm that do not exist.
 fn check_drivers(config: &Config) -> Result<(), Failure> {
-    let heads = Side::BOTH.map(|side| config.head(side));
-    let radio = &config.radio.driver;
-    let named = heads
-        .iter()
-        .flat_map(|head| [&head.camera.driver, &head.servos.driver])
-        .chain(Some(radio).filter(|driver| *driver != HCI))
-        .chain(config.arm.iter().map(|arm| &arm.driver));
-    match named.into_iter().find(|driver| *driver != "sim") {
-        None => Ok(()),
-        Some(driver) => Err(Failure::misuse(
-            format!("there is no driver \"{driver}\""),
-            "drivers are: sim (the simulated workcell) for all devices, hci for the radio too",
-        )),
+    match config.radio.driver.as_str() {
+        SIM | HCI => {}
+        other => return Err(drivers::unknown("radio", other, HCI)),
+    }
+    match &config.arm {
+        Some(arm) if arm.driver != SIM => Err(drivers::unknown("arm", &arm.driver, "no other")),
+        _ => Ok(()),
     }
 }
 
-fn unusable(error: impl std::fmt::Display) -> Failure {
+/// A configuration that cannot be used.
+pub fn unusable(error: impl std::fmt::Display) -> Failure {
     Failure::misuse(error, "compare with the workcell that is built in: `vergence workcell DIR`")
 }

@@ -25,6 +25,7 @@ use vergence_geometry::{Camera, CameraError, Distortion};
 use crate::dynamixel::DynamixelConfig;
 use crate::mjpeg::MjpegConfig;
 use crate::traits::Side;
+use crate::v4l2::V4l2Config;
 
 /// Why a configuration was refused.
 #[derive(Debug, thiserror::Error)]
@@ -116,6 +117,25 @@ pub struct CameraConfig {
     /// For the driver `mjpeg`.
     #[serde(default)]
     pub mjpeg: Option<MjpegConfig>,
+    /// For the driver `v4l2`.
+    #[serde(default)]
+    pub v4l2: Option<V4l2Config>,
+    /// For the driver `recording`.
+    #[serde(default)]
+    pub recording: Option<RecordingConfig>,
+}
+
+/// A camera that plays a recording.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RecordingConfig {
+    /// MCAP file, relative to the configuration's folder.
+    pub file: PathBuf,
+    /// Topic of its pictures.
+    pub topic: String,
+    /// Exposure time (s), when known.
+    #[serde(default)]
+    pub exposure: f64,
 }
 
 /// The servos' driver; what only one driver needs stands in the table of its name.

@@ -13,6 +13,7 @@ pub mod description;
 pub mod dynamixel;
 pub mod mjpeg;
 mod traits;
+pub mod v4l2;
 
 pub use arm::{Arm, ArmReading, Cancel, Execution, GripCommand, GripperReading, MotionLimits};
 pub use bodies::GripperJoints;

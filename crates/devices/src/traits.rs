@@ -60,6 +60,12 @@ pub trait Camera: Send {
     fn next_frame(&mut self, timeout: Duration) -> Result<Frame, DeviceError>;
 }
 
+impl<C: Camera + ?Sized> Camera for Box<C> {
+    fn next_frame(&mut self, timeout: Duration) -> Result<Frame, DeviceError> {
+        (**self).next_frame(timeout)
+    }
+}
+
 /// Angles of one head at one time, as the encoders tell them.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct JointReading {

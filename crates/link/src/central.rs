@@ -313,6 +313,8 @@ impl<'a, C: Controller + ControllerCmdSync<LeSetScanParams>> Central<'a, '_, C> 
                 }
                 Task::Write(record) => {
                     let handles = self.handles(&client, tag).await?;
+                    // Also when the answer to the last piece is lost.
+                    self.ears.rewritten(tag);
                     for message in Upload::messages(record) {
                         self.write(&client, tag, handles.upload, &message).await?;
                     }

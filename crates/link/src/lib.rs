@@ -9,6 +9,8 @@
 //! two tags that claim one object are both seen. A record whose object id is not the advertised one
 //! is refused. Links are ended after use, but held while a tag's light plays.
 
+#[cfg(feature = "bluez")]
+mod bluez;
 mod central;
 mod ears;
 mod flash;
@@ -19,6 +21,8 @@ mod server;
 mod simulation;
 mod virtual_tag;
 
+#[cfg(feature = "bluez")]
+pub use bluez::BluezLink;
 pub use central::LinkConfig;
 pub use flash::{BLOCK, MemoryFlash, OutOfBounds};
 pub use hci::HciLink;

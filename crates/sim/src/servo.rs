@@ -24,13 +24,15 @@ pub struct Servo {
     backlash: f64,
     rng: Pcg64Mcg,
     latency: f64,
+    /// Speed limit of the joint, and that of the move under way (rad/s).
+    limit: f64,
     speed: f64,
     /// Move under way: from, to (rad), began at (s).
     from: f64,
     to: f64,
     began: f64,
-    /// Goals that have not reached the motor yet: when they will (s), where to (rad).
-    pending: Vec<(f64, f64)>,
+    /// Goals that have not reached the motor yet: when they will (s), where to (rad), how fast (rad/s).
+    pending: Vec<(f64, f64, f64)>,
     /// State at `time`.
     time: f64,
     motor: f64,
@@ -48,6 +50,7 @@ impl Servo {
             backlash: stated_backlash * rng.random_range(OWN_SLACK),
             rng,
             latency: settings.latency,
+            limit: speed.max(1e-3),
             speed: speed.max(1e-3),
             from: 0.0,
             to: 0.0,
@@ -61,15 +64,27 @@ impl Servo {
 
     /// Commands an angle at time `now` (s).
     pub fn command(&mut self, now: f64, goal: f64) {
-        self.pending.push((now + self.latency, goal));
+        self.drive(now, goal, self.limit);
+    }
+
+    /// Commands an angle and a speed (rad/s) at time `now` (s).
+    pub fn drive(&mut self, now: f64, goal: f64, speed: f64) {
+        self.pending.push((now + self.latency, goal, speed.clamp(1e-3, self.limit)));
+    }
+
+    /// Stops where it is: without torque nothing moves, the gears hold the camera.
+    pub fn release(&mut self) {
+        self.pending.clear();
+        (self.from, self.to, self.began) = (self.motor, self.motor, self.time);
     }
 
     /// Moves on to a time (s); going back is ignored.
     pub fn advance(&mut self, time: f64) {
-        while let Some(&(at, goal)) = self.pending.first().filter(|(at, _)| *at <= time) {
+        while let Some(&(at, goal, speed)) = self.pending.first().filter(|p| p.0 <= time) {
             self.settle(at.max(self.time));
             let to = self.rest(goal);
             (self.from, self.to, self.began) = (self.motor, to, at);
+            self.speed = speed;
             self.pending.remove(0);
         }
         self.settle(time);
@@ -201,6 +216,18 @@ mod tests {
         assert!((arrive(&mut servo, 0.0, 20.0 * step) + half).abs() < 1e-12);
         assert!((arrive(&mut servo, 2.0, 40.0 * step) + half).abs() < 1e-12);
         assert!((arrive(&mut servo, 4.0, 20.0 * step) - half).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_released_servo_stays_where_it_is() {
+        let mut servo = servo();
+        servo.drive(0.0, 1.0, 0.5);
+        servo.advance(1.008);
+        servo.release();
+        let there = servo.motor;
+        assert!((there - 0.5).abs() < 0.01, "half a radian in a second, not {there}");
+        servo.advance(3.0);
+        assert!(servo.motor == there && !servo.moving());
     }
 
     #[test]

@@ -1,6 +1,8 @@
 //! The workcell as its user sees it: built from a configuration, opened as a robot.
 
 use std::collections::VecDeque;
+use std::io;
+use std::net::TcpListener;
 use std::path::Path;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
@@ -153,10 +155,7 @@ impl Workcell {
     /// Opens the devices. All robots of one workcell share its world and time.
     pub fn robot(&self) -> Robot {
         let head = |side: Side| {
-            let lens = lock(&self.world).heads[side as usize].lens;
-            let (camera, light) = (self.settings.camera, &self.settings.light);
-            let sensor = Sensor::new(lens, camera, light, self.seed, side as usize);
-            let world = self.world.clone();
+            let (sensor, world) = (self.sensor(side), self.world.clone());
             Head {
                 camera: Box::new(SimCamera { world: world.clone(), side, sensor, next: 0 }),
                 pan_tilt: Box::new(SimPanTilt { world, side }),
@@ -169,6 +168,24 @@ impl Workcell {
             // Contacts are simulated by another crate, which moves objects by `place_object`.
             arm: None,
         }
+    }
+
+    /// The sensor of a camera.
+    pub(crate) fn sensor(&self, side: Side) -> Sensor {
+        let lens = lock(&self.world).heads[side as usize].lens;
+        let (camera, light) = (self.settings.camera, &self.settings.light);
+        Sensor::new(lens, camera, light, self.seed, side as usize)
+    }
+
+    /// What its devices share.
+    pub(crate) fn world(&self) -> &Shared {
+        &self.world
+    }
+
+    /// Takes the tags to real time and to a listener, see [`crate::WiredWorkcell`].
+    pub(crate) fn serve_tags(&self, listener: TcpListener) -> io::Result<()> {
+        let world = &mut *lock(&self.world);
+        world.radio.serve(&self.settings, &world.objects, self.seed, listener, world.now)
     }
 
     /// The clock of all its devices.

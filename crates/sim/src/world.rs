@@ -67,7 +67,6 @@ impl Shutter {
 }
 
 /// The state of everything.
-#[derive(Debug)]
 pub struct World {
     pub(crate) settings: SimConfig,
     pub(crate) heads: [TrueHead; 2],

@@ -7,6 +7,7 @@ mod experiment;
 mod find;
 mod grasp;
 mod pose;
+mod sim;
 mod tag;
 mod tags;
 mod workcell;
@@ -32,6 +33,8 @@ pub enum Command {
     Evaluate(evaluate::Evaluate),
     /// Write the built-in workcell to a folder, to edit and use with --config.
     Workcell(workcell::Workcell),
+    /// Offer the simulated workcell's devices over the wires of real ones.
+    Sim(sim::Sim),
     /// Find blinking landmarks in a recording.
     Blink(blink::Args),
     /// Recognise objects of known size in a set of pictures.
@@ -48,6 +51,7 @@ pub fn run(command: Command) -> Result<bool, Failure> {
         Command::Experiment(args) => experiment::run(&args),
         Command::Evaluate(args) => evaluate::run(args),
         Command::Workcell(args) => workcell::run(&args),
+        Command::Sim(args) => sim::run(&args),
         Command::Blink(args) => blink::run(args),
         Command::Pose(args) => pose::run(args),
     }
