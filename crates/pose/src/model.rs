@@ -42,6 +42,9 @@ pub struct Segment {
     /// Outward normal of the face that turns away there, for silhouettes where it is flat: an
     /// object that rests on that face has a shadow, not a background, on the other side.
     pub away: Option<Vector3<f64>>,
+    /// Which part of the body's surface it lies on: the same number means the same place for every
+    /// eye (an edge of a polyhedron, a sector of a rim, a side of a wall).
+    pub part: u16,
 }
 
 /// The visible contour: reused between calls so that the search does not allocate.
@@ -65,6 +68,8 @@ pub(crate) struct Line {
     pub kind: Kind,
     /// As in [`Segment`].
     pub away: Option<Vector3<f64>>,
+    /// As in [`Segment`].
+    pub part: u16,
 }
 
 impl Outline {
@@ -132,6 +137,7 @@ impl Model {
             to: at(line.ends[1]),
             kind: line.kind,
             away: line.away,
+            part: line.part,
         }));
     }
 

@@ -43,8 +43,8 @@ pub type Nuisance = Vector4<f64>;
 pub struct Site {
     /// Which view.
     pub view: usize,
-    /// Which segment of the contour (counts through the view).
-    pub segment: usize,
+    /// Which part of the body the contour lies on there, as in [`crate::Segment`].
+    pub part: u16,
     /// Silhouette or crease.
     pub kind: Kind,
     /// Picture pixel.
@@ -129,7 +129,7 @@ pub fn sites(
     };
     let up_in_object = up.map(|up| pose.rotation.inverse() * up.into_inner());
     let mut profile = Vec::new();
-    for (index, segment) in contour.iter().enumerate() {
+    for segment in &contour {
         let [from, to] =
             [segment.from, segment.to].map(|p| optical_from_object * Point3::from(p * size));
         let (Some(a), Some(b)) = (camera.project(&from), camera.project(&to)) else { continue };
@@ -178,7 +178,7 @@ pub fn sites(
             };
             let mut site = Site {
                 view,
-                segment: index,
+                part: segment.part,
                 kind: segment.kind,
                 pixel: (pixel.x, pixel.y),
                 normal: (normal.x, normal.y),

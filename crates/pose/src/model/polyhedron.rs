@@ -137,7 +137,7 @@ impl Polyhedron {
             seen |= u128::from(face.normal.dot(eye) > face.offset) << k;
         }
         out.points.extend_from_slice(&self.vertices);
-        for edge in &self.edges {
+        for (part, edge) in self.edges.iter().enumerate() {
             let [a, b] = edge.faces.map(|f| seen >> f & 1 == 1);
             if !(a || b) {
                 continue;
@@ -147,7 +147,7 @@ impl Polyhedron {
                 true => (Kind::Crease, None),
                 false => (Kind::Silhouette, Some(self.faces[hidden].normal)),
             };
-            let line = Line { ends: edge.ends.map(|v| v as u16), kind, away };
+            let line = Line { ends: edge.ends.map(|v| v as u16), kind, away, part: part as u16 };
             if self.convex {
                 out.lines.push(line);
             } else {
