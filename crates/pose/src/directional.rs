@@ -7,15 +7,17 @@
 //! that a different pose would not ([`verdict`]).
 
 pub mod edges;
+mod equations;
 pub mod field;
 pub mod level;
+mod neighbours;
 pub mod picture;
 pub mod refine;
 pub mod search;
 pub mod sites;
 pub mod verdict;
 
-use nalgebra::{Matrix6, Vector3};
+use nalgebra::Vector3;
 use vergence_geometry::{GaussianPose, Transform};
 
 use crate::model::Model;
@@ -26,20 +28,6 @@ use refine::{EDGE_SD_PX, Pass, Refined};
 use search::{Search, Sight};
 use sites::Site;
 use verdict::Explained;
-
-/// The information counts what is modelled; measured errors have about this much more variance.
-const INFLATION: f64 = 2.5;
-/// No rotation is known better than this (rad): edges of real objects are not that straight.
-const ROTATION_FLOOR: f64 = 0.003;
-
-/// Covariance with what the model leaves out, so that the truth lies inside as often as it says.
-fn honest(covariance: &Matrix6<f64>) -> Matrix6<f64> {
-    let mut out = covariance * INFLATION;
-    for k in 0..3 {
-        out[(k, k)] += ROTATION_FLOOR * ROTATION_FLOOR;
-    }
-    out
-}
 
 /// Alternatives reported.
 const MOST_ALTERNATIVES: usize = 4;
@@ -134,7 +122,10 @@ pub fn recognise_traced<'a>(
     let rough = search.ranked(rough, config.distinct);
     let finalists = rough.iter().take(config.finalists);
     let fine = finalists.map(|(rough, _)| search.refine_finely(rough.clone())).collect();
-    let different = search.ranked(fine, config.different);
+    let mut different = search.ranked(fine, config.different);
+    if let Some(best) = different.first_mut() {
+        search.settle(best);
+    }
     let result = search.verdict(&different);
     let poses = different.iter().map(|(r, _)| r.pose).collect();
     let sites = different.into_iter().next().map(|(r, _)| r.sites).unwrap_or_default();
@@ -232,6 +223,11 @@ impl Search<'_> {
         passes.push(Pass::new(EDGE_SD_PX, 4.0, 2.0, true));
         passes.push(Pass::new(EDGE_SD_PX, 4.0, 2.0, true));
         self.refine(&mut refined, &passes);
+        self.both(refined)
+    }
+
+    /// What a refined pose explains at both scales.
+    fn both(&self, refined: Refined) -> (Refined, Explained) {
         // Print is fine, outlines are coarse: both scales have their say in what is explained.
         let s = self.scale();
         let (refined, coarse) = self.weigh(refined, &Pass::new(0.5 * s, 4.0 * s, 2.0 * s, false));
@@ -313,7 +309,7 @@ impl Search<'_> {
         alternatives.sort_by(|a, b| b.confidence.total_cmp(&a.confidence));
         alternatives.truncate(MOST_ALTERNATIVES);
         let found = ObjectPose {
-            pose: GaussianPose { pose: best.pose, covariance: honest(&best.covariance) },
+            pose: GaussianPose { pose: best.pose, covariance: best.covariance },
             confidence: 1.0 / total,
             coverage: explained.coverage,
             alternatives,

@@ -9,7 +9,7 @@ use vergence_imaging::{Image, kernel};
 
 /// Standard deviation of the smoothing before the derivative (px of the level): wide enough to
 /// average noise, narrow enough to keep edges two pixels apart.
-const SMOOTHING_PX: f32 = 0.9;
+const SMOOTHING_PX: f32 = 0.7;
 /// A gradient's noise is never taken to be lower (grey levels per pixel): quantisation.
 const NOISE_FLOOR: f32 = 0.12;
 

@@ -49,7 +49,7 @@ impl Frustum {
                 ));
                 let ends = [first, first + 1];
                 let part = side as u16;
-                out.lines.push(Line { ends, kind: Kind::Silhouette, away: None, part });
+                out.lines.push(Line { ends, kind: Kind::Silhouette, away: None, part, along: 0.0 });
             }
         }
     }
@@ -80,16 +80,9 @@ impl Frustum {
     }
 }
 
-/// Parts of a rim: about as long as the places along which an edge errs alike.
-const SECTORS: u16 = 16;
-/// Numbers of the first part of either rim; the wall's two sides come before.
+/// Numbers of the rims; the wall's two sides come before.
 const TOP: u16 = 2;
-const BOTTOM: u16 = TOP + SECTORS;
-
-/// The sector of an azimuth (rad), whatever the eye.
-fn sector(azimuth: f64) -> u16 {
-    ((azimuth.rem_euclid(TAU) / TAU * f64::from(SECTORS)) as u16).min(SECTORS - 1)
-}
+const BOTTOM: u16 = 3;
 
 fn arc(
     radius: f64,
@@ -107,14 +100,13 @@ fn arc(
     let (sin, cos) = (length / n as f64).sin_cos();
     // Chords of the circle that is as far outside at the corners as inside at the middles.
     let r = radius * 2.0 / (1.0 + (length / (2.0 * n as f64)).cos());
-    let first_part = if z > 0.0 { TOP } else { BOTTOM };
+    let part = if z > 0.0 { TOP } else { BOTTOM };
     let mut p = Vector3::new(r * start.cos(), r * start.sin(), z);
     for k in 0..n {
         let first = out.points.len() as u16;
         out.points.push(p);
-        let middle = start + length * (k as f64 + 0.5) / n as f64;
-        let part = first_part + sector(middle);
-        out.lines.push(Line { ends: [first, first + 1], kind, away, part });
+        let along = radius * (start + length * k as f64 / n as f64).rem_euclid(TAU);
+        out.lines.push(Line { ends: [first, first + 1], kind, away, part, along });
         p = Vector3::new(p.x * cos - p.y * sin, p.x * sin + p.y * cos, z);
     }
     out.points.push(p);
@@ -139,8 +131,8 @@ pub(super) fn sphere_outline(radius: f64, eye: &Vector3<f64>, chords: usize, out
     out.points.extend((0..chords).map(at));
     for k in 0..chords as u16 {
         let ends = [k, (k + 1) % chords as u16];
-        let part = k * SECTORS / chords as u16;
-        out.lines.push(Line { ends, kind: Kind::Silhouette, away: None, part });
+        let along = r * TAU * f64::from(k) / chords as f64;
+        out.lines.push(Line { ends, kind: Kind::Silhouette, away: None, part: 0, along });
     }
 }
 
