@@ -12,14 +12,18 @@ use nalgebra::{Matrix6, Vector6};
 use vergence_geometry::Transform;
 use vergence_geometry::gaussian::{difference, perturb};
 
-use super::refine::{EDGE_SD_PX, Pass, Refined};
+use super::refine::{FINAL, Pass, Refined};
 use super::search::Search;
 use super::verdict::Explained;
 
 /// How far the contour is moved (px of the working scale, which is at most two of the picture's).
 const HOP_PX: f64 = 2.5;
+/// A start that comes this near (px) to a known optimum with its first pass will end there.
+const CAUGHT_PX: f64 = 0.4;
 /// Optima whose contours are nearer than this (px) are one.
 const SAME_PX: f64 = 0.2;
+/// Optima with lower odds do not count.
+const LEAST_ODDS: f64 = 0.01;
 /// A direction is left out when it takes more than this (rad or m) to move the contour that far: a
 /// turn about the axis of a solid of revolution.
 const BLIND: f64 = 0.2;
@@ -38,23 +42,16 @@ impl Search<'_> {
         let mut optima = vec![best.clone()];
         for start in self.starts(&best.0, &metric) {
             let mut trial = Refined { pose: start, ..best.0.clone() };
-            self.refine(
-                &mut trial,
-                &[
-                    Pass::new(1.0, 5.0, 3.0, true),
-                    Pass::new(0.6, 4.0, 2.5, true),
-                    Pass::new(EDGE_SD_PX, 4.0, 2.0, true),
-                    Pass::new(EDGE_SD_PX, 4.0, 2.0, true),
-                ],
-            );
-            let trial = self.both(trial);
-            match optima.iter_mut().find(|o| apart(&o.0, &trial.0) < SAME_PX) {
-                Some(known) if known.1.evidence < trial.1.evidence => *known = trial,
-                Some(_) => {}
-                None => optima.push(trial),
+            self.refine(&mut trial, &[Pass::new(1.0, 5.0, 3.0, true)]);
+            if optima.iter().any(|o| apart(&o.0, &trial) < CAUGHT_PX) {
+                continue;
+            }
+            self.refine(&mut trial, &[Pass::new(0.6, 4.0, 2.5, true), FINAL, FINAL]);
+            if optima.iter().all(|o| apart(&o.0, &trial) > SAME_PX) {
+                optima.push(self.both(trial));
             }
         }
-        *best = mixture(optima);
+        *best = self.mixture(optima);
     }
 
     /// Poses whose contours lie off the given one's, one for every direction and sense.
@@ -80,22 +77,22 @@ fn contour_metric(refined: &Refined) -> Matrix6<f64> {
     metric / refined.sites.len().max(1) as f64
 }
 
-/// The best of some optima with the second moment of all about it.
-fn mixture(optima: Vec<(Refined, Explained)>) -> (Refined, Explained) {
-    let mut best = 0;
-    for (k, o) in optima.iter().enumerate() {
-        if o.1.evidence > optima[best].1.evidence {
-            best = k;
+impl Search<'_> {
+    /// The best of some optima with the second moment of all about it.
+    fn mixture(&self, mut optima: Vec<(Refined, Explained)>) -> (Refined, Explained) {
+        optima.sort_by(|a, b| b.1.evidence.total_cmp(&a.1.evidence));
+        let best = optima[0].1;
+        let odds = |e: &Explained| ((e.evidence - best.evidence) / NATS_TO_ONE).exp();
+        optima.retain(|o| odds(&o.1) > LEAST_ODDS);
+        let (mut covariance, mut total) = (Matrix6::zeros(), 0.0);
+        let place = optima[0].0.pose;
+        for (refined, explained) in &mut optima {
+            self.doubt(refined, &FINAL);
+            let d = difference(&place, &refined.pose);
+            covariance += (refined.covariance + d * d.transpose()) * odds(explained);
+            total += odds(explained);
         }
+        let top = optima.swap_remove(0).0;
+        (Refined { covariance: covariance / total, ..top }, best)
     }
-    let top = &optima[best];
-    let (mut covariance, mut total) = (Matrix6::zeros(), 0.0);
-    for o in &optima {
-        let odds = ((o.1.evidence - top.1.evidence) / NATS_TO_ONE).exp();
-        let d = difference(&top.0.pose, &o.0.pose);
-        covariance += (o.0.covariance + d * d.transpose()) * odds;
-        total += odds;
-    }
-    let covariance = covariance / total;
-    (Refined { covariance, ..top.0.clone() }, top.1)
 }

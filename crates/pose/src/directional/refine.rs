@@ -81,9 +81,12 @@ pub struct Pass {
     pub fine: bool,
 }
 
+/// The last pass: full resolution, tight.
+pub const FINAL: Pass = Pass::new(EDGE_SD_PX, 4.0, 2.0, true);
+
 impl Pass {
     /// A pass from its numbers: deviation, range to either side, spacing of sites (picture px).
-    pub fn new(sd_px: f64, range_px: f64, spacing_px: f64, fine: bool) -> Self {
+    pub const fn new(sd_px: f64, range_px: f64, spacing_px: f64, fine: bool) -> Self {
         Pass { sd_px, layout: Layout { spacing_px, range_px }, fine }
     }
 }
@@ -128,11 +131,15 @@ impl Search<'_> {
             }
             refined.apply(&moved);
         }
-        if let Some(pass) = passes.last() {
-            let still = Move { shared: Vector7::zeros(), own: vec![Vector4::zeros(); views] };
-            self.step(refined, pass, &still, DOUBT);
-        }
         refined.strain = self.strain(refined);
+    }
+
+    /// The covariance of a refined pose, with all that sites have in common taken seriously.
+    pub fn doubt(&self, refined: &mut Refined, pass: &Pass) {
+        self.lay_out(refined, pass);
+        let views = self.sights.len();
+        let still = Move { shared: Vector7::zeros(), own: vec![Vector4::zeros(); views] };
+        self.step(refined, pass, &still, DOUBT);
     }
 
     /// Looks for the edges around a refined pose anew.

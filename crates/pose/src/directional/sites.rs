@@ -243,11 +243,18 @@ fn find_edges(site: &mut Site, level: &Level, range_px: f64, profile: &mut Vec<f
     let (x, y) = level.from_picture(site.pixel.0, site.pixel.1);
     let (nx, ny) = site.normal;
     let reach = (range_px / scale).ceil() as i32 + 1;
+    // Slopes as differences of values half a pixel to either side. Outside the picture: none.
     profile.clear();
+    let value = |k: i32| {
+        let offset = f64::from(k) - 0.5;
+        let (px, py) = (x + nx * offset, y + ny * offset);
+        level.contains(px, py).then(|| level.value(px, py))
+    };
+    let mut behind = value(-reach);
     for k in -reach..=reach {
-        let (px, py) = (x + nx * f64::from(k), y + ny * f64::from(k));
-        let inside = level.contains(px, py);
-        profile.push(if inside { level.slope(px, py, nx as f32, ny as f32) } else { 0.0 });
+        let ahead = value(k + 1);
+        profile.push(ahead.zip(behind).map_or(0.0, |(a, b)| a - b));
+        behind = ahead;
     }
     let threshold = NOISE_FACTOR * level.noise;
     let mut strongest = 0.0f32;
