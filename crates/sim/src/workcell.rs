@@ -295,7 +295,10 @@ fn true_head(
     let stretch = 1.0 + normal(&mut rng) * focal_ratio;
     (lens.fx, lens.fy) = (lens.fx * stretch, lens.fy * stretch);
     let speed = |k: usize| chain.joints.get(k).map_or(1.0, |joint| joint.limits.velocity);
-    let servos = [0, 1].map(|k| Servo::new(&settings.servos, speed(k)));
+    let servos = [0, 1].map(|k| {
+        let rng = stream(seed, "servo", 2 * side as u64 + k as u64);
+        Servo::new(&settings.servos, speed(k), rng)
+    });
     TrueHead { chain, lens, servos }
 }
 

@@ -23,6 +23,7 @@ use crate::system::System;
 mod blink;
 mod centre;
 mod collect;
+mod reaim;
 mod search;
 
 pub use collect::{CollectConfig, CollectError, LightMover, Placed, Session, collect};
@@ -50,6 +51,11 @@ pub struct FindConfig {
     pub link_tries: usize,
     /// Searches that are started when a light turned out not to be the tag's.
     pub search_tries: usize,
+    /// Standard deviation of the landmark's distance that is good enough (m): aiming again ends there.
+    pub depth_sigma: f64,
+    /// Most times that the heads aim again to average over the encoders' steps; the paper's method
+    /// never does.
+    pub reaims: usize,
     /// Seed for the choice of patterns.
     pub seed: u64,
 }
@@ -62,6 +68,8 @@ impl Default for FindConfig {
             link_timeout: Duration::from_secs(2),
             link_tries: 3,
             search_tries: 3,
+            depth_sigma: 0.002,
+            reaims: 16,
             seed: 0,
         }
     }
@@ -206,6 +214,8 @@ pub(crate) struct Run<'a> {
     pub(crate) observer: &'a mut dyn Observer,
     timeline: Vec<Step>,
     pub(crate) landmark: Option<LandmarkReport>,
+    /// Time between two pictures, known when the tag blinks.
+    interval: Duration,
 }
 
 impl<'a> Run<'a> {
@@ -215,7 +225,14 @@ impl<'a> Run<'a> {
         config: &'a FindConfig,
         observer: &'a mut dyn Observer,
     ) -> Self {
-        Run { system, config, observer, timeline: Vec::new(), landmark: None }
+        Run {
+            system,
+            config,
+            observer,
+            timeline: Vec::new(),
+            landmark: None,
+            interval: Duration::ZERO,
+        }
     }
 }
 
@@ -250,7 +267,7 @@ impl Run<'_> {
             if !matches!(seen, Err(Stop::NotSeen { missing: Missing::Either, .. })) {
                 pattern = self.step("challenge", |run| run.challenge(tag, pattern))?;
             }
-            match seen.and_then(|seen| self.fixate(&pattern, seen)) {
+            match seen.and_then(|seen| self.fixate(tag, &pattern, seen)) {
                 Err(
                     Stop::Lost(_)
                     | Stop::Triangulation(_)
@@ -263,14 +280,19 @@ impl Run<'_> {
         }
     }
 
+    /// Centres the light and measures where it is; gives the heads' angles too.
     fn fixate(
         &mut self,
+        tag: TagAddress,
         pattern: &Pattern,
         seen: [search::Seen; 2],
     ) -> Result<(GaussianPoint, [[f64; 2]; 2]), Stop> {
         let held = self.step("centre", |run| run.centre(pattern, seen))?;
-        let landmark = self.step("triangulate", |run| run.triangulate(&held))?;
-        Ok((landmark, held.map(|fixation| fixation.angles)))
+        let first = self.step("triangulate", |run| run.triangulate(&held))?;
+        if self.config.method == Method::Paper {
+            return Ok((first, held.map(|fixation| fixation.angles)));
+        }
+        self.step("aim again", |run| run.reaim(tag, &held, first))
     }
 
     /// Runs one step and enters its times in the timeline.

@@ -305,7 +305,7 @@ impl Run<'_> {
         // The report keeps where the landmark was found at first.
         let first = self.landmark.clone();
         let pattern = self.start_blinking(tag)?;
-        let located = self.locate_near(&pattern, near);
+        let located = self.locate_near(tag, &pattern, near);
         let stopped = self.command(tag, LedCommand::Stop);
         self.landmark = first;
         let located = located?;

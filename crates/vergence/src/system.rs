@@ -104,7 +104,8 @@ impl System {
         for ((head, target), (geometry, from)) in
             self.robot.heads.iter_mut().zip(targets).zip(self.heads.iter().zip(before))
         {
-            let Some([pan, tilt]) = target else { continue };
+            // A reading may lie beyond the limit by half a step; nobody can be sent back there.
+            let Some([pan, tilt]) = target.map(|angles| geometry.clamp(angles)) else { continue };
             head.pan_tilt.move_to(pan, tilt)?;
             for (joint, turn) in
                 geometry.chain.joints.iter().zip([pan - from.pan, tilt - from.tilt])

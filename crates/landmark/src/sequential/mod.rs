@@ -31,6 +31,7 @@ mod verdict;
 
 use std::time::Duration;
 
+use nalgebra::Point2;
 use vergence_imaging::{Frame, Image};
 use vergence_tag::Pattern;
 
@@ -41,7 +42,7 @@ use history::{History, Past};
 use motion::{Placement, Reference};
 use nuisance::{Lamps, Nuisance, STILL_PX};
 use places::Places;
-use scan::{BlockNoise, Candidate, Family};
+use scan::{BlockNoise, Candidate, Family, Strong};
 use verdict::{Banks, Round};
 
 /// Settings of the sequential finder.
@@ -100,6 +101,8 @@ pub struct SequentialFinder {
     noise: BlockNoise,
     lamps: Lamps,
     places: Places,
+    /// Places that varied more than the noise explains when last looked.
+    restless: Vec<Point2<f64>>,
     banks: Banks,
     decisions: Vec<Decision>,
     frames: usize,
@@ -124,6 +127,7 @@ impl SequentialFinder {
             noise: BlockNoise::default(),
             lamps: Lamps::default(),
             places: Places::default(),
+            restless: Vec::new(),
             frames: 0,
             next_scan: FIRST_SCAN,
             size: (0, 0),
@@ -150,7 +154,10 @@ impl SequentialFinder {
             self.places.renew(candidates, KEEP * self.presence());
         }
         if scan || self.frames <= FIRST_SCAN || self.frames.is_multiple_of(STRONG_EVERY) {
-            for pixel in scan::by_energy(energy, width, height, n, &self.noise) {
+            let strong = scan::by_energy(energy, width, height, n, &self.noise);
+            let point = |s: &Strong| Point2::new(s.pixel.0 as f64, s.pixel.1 as f64);
+            self.restless = strong.iter().filter(|s| s.restless).map(point).collect();
+            for Strong { pixel, .. } in strong.into_iter().take(scan::BY_ENERGY) {
                 self.places.add(pixel, 0..self.requests.len());
             }
         }
@@ -158,6 +165,8 @@ impl SequentialFinder {
             return;
         }
         let nuisance = Nuisance::of(&self.history, &self.lamps);
+        let known =
+            self.decisions.iter().filter_map(Decision::brightest).map(|s| s.pixel).collect();
         let round = Round {
             requests: &self.requests,
             config: &self.config,
@@ -167,6 +176,8 @@ impl SequentialFinder {
             frames: self.frames,
             stamp,
             size: self.size,
+            restless: &self.restless,
+            known,
         };
         let places = self.places.as_mut_slice();
         round.decide(places, &mut self.banks, last, &mut self.decisions);

@@ -14,7 +14,7 @@ use std::time::Duration;
 use nalgebra::{Matrix2, Point2};
 
 use super::Config;
-use super::evidence::{Evidence, Series, refine, unexplained, weigh};
+use super::evidence::{Evidence, Series, refine, refined_gain, unexplained, weigh};
 use super::front::{BLOB_VARIANCE, BOX_SHARE};
 use super::history::{History, noise_share};
 use super::nuisance::{Nuisance, dot};
@@ -27,8 +27,9 @@ use crate::{Decision, Request, Sighting};
 /// Changes of the light that must have been seen: one more than a passing thing and its shadow make.
 const TRANSITIONS: f64 = 5.0;
 
-/// Share of the explained energy that may stay unexplained beyond the noise.
-const MISFIT: f64 = 0.35;
+/// Share of the explained energy that may stay unexplained beyond the noise: what phase, saturation,
+/// shake and JPEG leave of a tag's light is below a twentieth, a foreign code leaves more than a tenth.
+const MISFIT: f64 = 0.1;
 
 /// Factor on the noise of the neighbourhood before anything counts as unexplained.
 const NOISE_SLACK: f64 = 1.5;
@@ -48,6 +49,10 @@ const FOREIGN: [f64; 6] = [1.0, 1.5, 2.0, 3.0, 4.0, 6.0];
 /// Systematic part of a position's standard deviation (px): a light is no perfect point.
 const FLOOR_PX: f64 = 0.02;
 
+/// Restless places to reckon with, for every pixel, where the picture shows none but the one in
+/// question: one in a hundred pictures of 640x480.
+const UNSEEN: f64 = 0.01 / (640.0 * 480.0);
+
 /// Share of the presence threshold from which a pixel is looked at closer: the rest may be lost
 /// between pixels.
 const CLOSER: f64 = 0.5;
@@ -62,6 +67,10 @@ pub struct Round<'a> {
     pub frames: usize,
     pub stamp: Duration,
     pub size: (usize, usize),
+    /// Places that vary more than the noise around explains.
+    pub restless: &'a [Point2<f64>],
+    /// Places of the lights that are known.
+    pub known: Vec<Point2<f64>>,
 }
 
 /// A place with the evidence for one request.
@@ -112,11 +121,7 @@ impl Banks {
 }
 
 /// The bank of a slot, brought up to the window of this round.
-fn fitted<'a>(
-    slot: &'a mut Option<Bank>,
-    round: &Round,
-    new: impl FnOnce() -> Bank,
-) -> &'a Bank {
+fn fitted<'a>(slot: &'a mut Option<Bank>, round: &Round, new: impl FnOnce() -> Bank) -> &'a Bank {
     let bank = slot.get_or_insert_with(new);
     bank.fit(round.history.times(), round.history.numbers(), round.nuisance);
     bank
@@ -133,6 +138,17 @@ impl Round<'_> {
     /// Log likelihood ratio that presence needs.
     fn presence(&self) -> f64 {
         presence(self.size, self.requests.len(), self.config.false_alarm)
+    }
+
+    /// Log likelihood ratio that presence needs over places that vary more than the noise around
+    /// explains: they are few, but nothing is known of how they vary. Places close by may be ghosts of
+    /// this one, and a light that is known already is not restless.
+    fn presence_if_restless(&self, place: Point2<f64>) -> f64 {
+        let far = |a: &Point2<f64>, b: &Point2<f64>| (a - b).norm() > GHOST.0;
+        let others = self.restless.iter().filter(|p| far(p, &place));
+        let unknown = others.filter(|p| self.known.iter().all(|k| far(p, k))).count();
+        let expected = unknown as f64 + UNSEEN * (self.size.0 * self.size.1) as f64;
+        (expected * self.requests.len() as f64 / self.config.false_alarm).ln()
     }
 
     /// Log likelihood ratio from which a pixel is looked at closer.
@@ -320,7 +336,8 @@ impl Round<'_> {
             }
         }
         for _ in 0..2 {
-            evidence = refine(&series, pattern, self.history.times(), self.nuisance, evidence, step);
+            evidence =
+                refine(&series, pattern, self.history.times(), self.nuisance, evidence, step);
             let best = (evidence.best.phase, evidence.best.rate);
             series.expect(pattern, self.history.times(), best, self.nuisance, &mut expected);
             let moved = self.peak(place, &expected, &mut raw);
@@ -371,7 +388,7 @@ impl Round<'_> {
     /// Presence, quality of the fit, margins.
     fn stands(&self, request: usize, seen: &Seen, banks: &mut Banks) -> bool {
         let (own, series) = (seen.evidence, &seen.series);
-        if own.log_ratio < self.presence() {
+        if own.log_ratio < self.presence() || own.restless < self.presence_if_restless(seen.place) {
             return false;
         }
         let rest = unexplained(series, &own) - NOISE_SLACK * series.freedom * series.noise;
@@ -382,9 +399,14 @@ impl Round<'_> {
         let others = self.requests.len() - 1;
         for other in (0..self.requests.len()).filter(|o| *o != request) {
             let limit = own.log_ratio - self.margin(others);
-            match weigh(series, banks.own(self, other), limit, &mut scratch) {
-                Some(evidence) if evidence.log_ratio > limit => return false,
-                _ => {}
+            let bank = banks.own(self, other);
+            let Some(rival) = weigh(series, bank, 0.0, &mut scratch) else { continue };
+            // A strong light tells phases apart that the bank does not have.
+            let pattern = &self.requests[other].pattern;
+            let times = self.history.times();
+            let gain = refined_gain(series, pattern, times, self.nuisance, rival, bank.step);
+            if rival.log_ratio + gain > limit {
+                return false;
             }
         }
         let Some(rate) = self.config.foreign_rate else { return true };

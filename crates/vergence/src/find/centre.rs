@@ -2,7 +2,7 @@
 //! angles give its place.
 
 use nalgebra::Point3;
-use vergence_devices::{JointReading, Side};
+use vergence_devices::{JointReading, Side, TagAddress};
 use vergence_geometry::GaussianPoint;
 use vergence_head::{
     Fixation, Fixator, FixatorConfig, GATE_SIGMAS, NextMove, Noise, PaperAngles, epipolar_gap,
@@ -63,6 +63,7 @@ impl Run<'_> {
     /// heads' angles too.
     pub(crate) fn locate_near(
         &mut self,
+        tag: TagAddress,
         pattern: &Pattern,
         near: &Point3<f64>,
     ) -> Result<(GaussianPoint, [[f64; 2]; 2]), Stop> {
@@ -83,9 +84,7 @@ impl Run<'_> {
             Seen { joints: joints[0], sightings: left },
             Seen { joints: joints[1], sightings: right },
         ];
-        let held = self.centre(pattern, seen)?;
-        let landmark = self.triangulate(&held)?;
-        Ok((landmark, held.map(|fixation| fixation.angles)))
+        self.fixate(tag, pattern, seen)
     }
 
     /// Of all places that either head saw, the pair that can be one light: the brightest whose lines
@@ -132,17 +131,23 @@ impl Run<'_> {
         sightings.into_iter().min_by(|a, b| distance(a).total_cmp(&distance(b)))
     }
 
-    /// The landmark in the base frame, with equation (1) of the paper beside the exact point.
+    /// The landmark in the base frame from one fixation of either head.
     pub(super) fn triangulate(&mut self, held: &[Fixation; 2]) -> Result<GaussianPoint, Stop> {
         let heads = &self.system.heads;
         let landmark = triangulate(heads, held, &self.noise())?.point;
+        self.located(&landmark, held);
+        Ok(landmark)
+    }
+
+    /// Reports where the landmark is, with equation (1) of the paper for the same angles.
+    pub(super) fn located(&mut self, landmark: &GaussianPoint, held: &[Fixation; 2]) {
+        let heads = &self.system.heads;
         let axes = [0, 1].map(|k| heads[k].chain.joints[0].parent_from_joint.translation.vector);
         let baseline = (axes[0] - axes[1]).norm();
         let angles = PaperAngles::from_pan_tilt(held[0].angles, held[1].angles);
         let distance = paper_distance(&angles, baseline).unwrap_or(f64::INFINITY);
-        self.landmark = Some(LandmarkReport::new(&landmark, distance));
-        self.observer.notice(&Event::Landmark(&landmark, distance));
-        Ok(landmark)
+        self.landmark = Some(LandmarkReport::new(landmark, distance));
+        self.observer.notice(&Event::Landmark(landmark, distance));
     }
 
     /// Angle noise of the coarser head.
