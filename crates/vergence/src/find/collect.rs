@@ -12,7 +12,7 @@ use std::time::Duration;
 use nalgebra::{Point2, Point3};
 use vergence_devices::{DeviceError, JointReading, LedCommand, TagAddress};
 use vergence_head::calibration::{KnownLength, LightPlace};
-use vergence_head::{FixatorConfig, PanTiltHead, run_up};
+use vergence_head::{Fixation, FixatorConfig, PanTiltHead, run_up};
 use vergence_landmark::Sighting;
 use vergence_tag::Pattern;
 
@@ -163,7 +163,10 @@ impl Run<'_> {
                 let ray = heads[k].ray(first[k].angles, &first[k].pixel);
                 let expected = heads[k].project([joints[k].pan, joints[k].tilt], &ray.at(1.0));
                 if let Some(sighting) = expected.and_then(|pixel| nearest(found, &pixel)) {
-                    place.fixations[k].push(fixation(&joints[k], &sighting));
+                    // As a find corrects its angles, so that the joints' zeros fit it.
+                    let angles = self.camera_angles(k, &joints[k]);
+                    let seen = fixation(&joints[k], &sighting);
+                    place.fixations[k].push(Fixation { angles, ..seen });
                 }
             }
         }
