@@ -2,8 +2,8 @@
 //! which says what really happens.
 //!
 //! The object that is to be grasped is loose; the table, the other objects and the untagged things
-//! are fixed. After every motion the object is put into the workcell where the physics has it, so
-//! that the cameras see it there. Pictures do not show the arm itself.
+//! are fixed. After every motion the object and the arm's links are put into the workcell where the
+//! physics has them, so that the cameras see them there and what they hide is hidden.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -14,11 +14,11 @@ use vergence_devices::{
     Arm, ArmReading, Clock, Description, DeviceError, Execution, GripCommand, GripperReading,
     MotionLimits,
 };
-use vergence_geometry::{Trajectory, Transform};
+use vergence_geometry::{Body, Trajectory, Transform};
 use vergence_grasp::{Config, Obstacle, gripper, object};
 use vergence_physics::experiment::{Cell, HOME, table};
 use vergence_physics::{PhysicsArm, SharedWorld, Touch, TrueObject};
-use vergence_sim::Workcell;
+use vergence_sim::{ArmPart, Workcell};
 
 use crate::failure::Failure;
 
@@ -76,6 +76,13 @@ pub struct SimArm {
     bench: SharedBench,
     workcell: Arc<Workcell>,
     object: String,
+    links: Vec<Link>,
+}
+
+/// A part of the arm and how bright it is.
+struct Link {
+    body: Body,
+    albedo: f32,
 }
 
 /// Builds the physics of a workcell around one object; `None` when there is no such object.
@@ -133,16 +140,62 @@ pub fn build(
         collision: None,
         closing_error_mm: None,
     }));
+    let links = links(description, &cell);
     let arm = PhysicsArm::new(world, Some(Arc::from(clock)));
-    let arm =
-        SimArm { arm, bench: bench.clone(), workcell: workcell.clone(), object: object.into() };
+    let (workcell, object) = (workcell.clone(), object.into());
+    let arm = SimArm { arm, bench: bench.clone(), workcell, object, links };
+    arm.show();
     Ok(Some((arm, bench)))
+}
+
+/// What cameras see of the arm: what its joints move, and the link that these stand on. The heads do
+/// not see themselves.
+fn links(description: &Description, cell: &Cell) -> Vec<Link> {
+    let robot = description.robot();
+    let first = cell.chain.joints.first().map(|joint| joint.name.as_str());
+    let pedestal = robot.joints.iter().find(|joint| Some(joint.name.as_str()) == first);
+    let pedestal = pedestal.map(|joint| joint.parent.link.as_str());
+    let seen = |body: &&Body| body.joints > 0 || Some(body.name.as_str()) == pedestal;
+    let bodies = cell.bodies.iter().filter(seen);
+    bodies
+        .map(|body| Link { body: body.clone(), albedo: albedo(description, &body.name) })
+        .collect()
+}
+
+/// Brightness of a link's first material; grey when the description gives none.
+fn albedo(description: &Description, link: &str) -> f32 {
+    let robot = description.robot();
+    let visual = robot.links.iter().find(|l| l.name == link).and_then(|l| l.visual.first());
+    let named = visual.and_then(|v| v.material.as_ref());
+    let colour = named.and_then(|m| {
+        let own = m.color.as_ref();
+        own.or_else(|| robot.materials.iter().find(|o| o.name == m.name)?.color.as_ref())
+    });
+    colour.map_or(0.5, |c| (c.rgba.0.iter().take(3).sum::<f64>() / 3.0) as f32)
 }
 
 impl SimArm {
     fn show(&self) {
         let pose = lock(&self.bench).pose();
         self.workcell.place_object(&self.object, &pose);
+        let world = self.arm.world();
+        let frames = world.arm().chain().frames(world.joints());
+        let open = 0.5 * world.jaws().opening();
+        drop(world);
+        let parts: Vec<ArmPart> = self
+            .links
+            .iter()
+            .map(|Link { body, albedo }| {
+                let base = body.joints.checked_sub(1).map_or(Transform::identity(), |k| frames[k]);
+                let slide = Transform::from_parts((body.slide * open).into(), Default::default());
+                ArmPart {
+                    base_from_solid: base * slide * body.frame_from_solid,
+                    solid: body.solid.clone(),
+                    albedo: *albedo,
+                }
+            })
+            .collect();
+        self.workcell.show_arm(&parts);
     }
 }
 
