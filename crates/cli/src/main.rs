@@ -13,6 +13,7 @@ mod progress;
 mod radio;
 mod robot;
 mod save;
+mod signing;
 
 use std::process::ExitCode;
 

@@ -8,8 +8,10 @@ use vergence_devices::clock::SystemClock;
 use vergence_devices::{Clock, Config};
 use vergence_link::{BOND_BYTES, Bond, HciLink, LinkConfig};
 use vergence_sim::Workcell;
+use vergence_tag::signature::TrustedKeys;
 
 use crate::failure::Failure;
+use crate::signing;
 
 /// An opened radio.
 pub struct Radio {
@@ -17,6 +19,8 @@ pub struct Radio {
     pub link: HciLink,
     /// The time that it runs on.
     pub clock: Box<dyn Clock>,
+    /// Whose signatures on records count.
+    pub trusted: TrustedKeys,
     /// Where its bonds are kept.
     bonds: Option<PathBuf>,
 }
@@ -35,16 +39,17 @@ pub fn open(config: &Config, folder: &Path) -> Result<Radio, Failure> {
         }
     };
     let link = link.map_err(|error| Failure::failed(error, "is the controller there and free?"))?;
+    let trusted = signing::trusted(config, folder)?;
     let bonds = radio.bonds.as_ref().map(|file| folder.join(file));
-    let mut radio = Radio { link, clock: Box::new(SystemClock::start()), bonds };
+    let mut radio = Radio { link, clock: Box::new(SystemClock::start()), trusted, bonds };
     radio.load()?;
     Ok(radio)
 }
 
 impl Radio {
     /// The radio of a simulated workcell, whose tags and bonds live as long as the program.
-    pub fn simulated(workcell: &Workcell) -> Self {
-        Radio { link: workcell.radio(), clock: workcell.clock(), bonds: None }
+    pub fn simulated(workcell: &Workcell, trusted: TrustedKeys) -> Self {
+        Radio { link: workcell.radio(), clock: workcell.clock(), trusted, bonds: None }
     }
 
     /// Takes up the bonds of earlier runs.

@@ -8,10 +8,12 @@ use vergence::report::{Report, TruthReport, numbers};
 use vergence_devices::{Config, Description, Robot};
 use vergence_geometry::Transform;
 use vergence_sim::{Scenario, SimConfig, Workcell};
+use vergence_tag::signature::TrustedKeys;
 
 use crate::drivers::{self, HCI, SIM};
 use crate::failure::Failure;
 use crate::radio::{self, Radio};
+use crate::signing;
 
 /// Which robot.
 #[derive(Args, Clone, Default)]
@@ -51,9 +53,10 @@ impl RobotArgs {
             Some(path) => {
                 let (config, description) = read(path)?;
                 check_radio(&config)?;
+                let signers = signing::required(&config, folder(path))?;
                 if !drivers::simulated(&config)? {
                     let devices = drivers::open(&config, &description, folder(path))?;
-                    return Opened::wired(config, description, devices);
+                    return Opened::wired(config, description, devices)?.signed_by(signers);
                 }
                 let workcell = Workcell::from_config(&config, &description, self.seed);
                 let workcell = workcell.map_err(unusable)?;
@@ -61,7 +64,7 @@ impl RobotArgs {
                 if config.radio.driver == HCI {
                     devices.radio = Box::new(radio::open(&config, folder(path))?.link);
                 }
-                Opened::new(workcell, devices)
+                Opened::new(workcell, devices)?.signed_by(signers)
             }
             None => Opened::embedded(self.seed, Scenario::Default),
         }
@@ -86,11 +89,13 @@ impl RobotArgs {
                 if config.radio.driver == HCI {
                     return radio::open(&config, folder(path));
                 }
-                Workcell::from_config(&config, &description, self.seed)
+                let workcell = Workcell::from_config(&config, &description, self.seed);
+                let trusted = signing::trusted(&config, folder(path))?;
+                return Ok(Radio::simulated(&workcell.map_err(unusable)?, trusted));
             }
             None => Workcell::embedded(self.seed),
         };
-        Ok(Radio::simulated(&workcell.map_err(unusable)?))
+        Ok(Radio::simulated(&workcell.map_err(unusable)?, TrustedKeys::default()))
     }
 }
 
@@ -112,6 +117,12 @@ impl Opened {
         let (config, description) = (workcell.config().clone(), workcell.description().clone());
         let system = System::new(devices, &config, &description).map_err(unusable)?;
         Ok(Opened { system, config, description, workcell: Some(workcell) })
+    }
+
+    /// The same, for records that one of these keys signed.
+    fn signed_by(mut self, signers: Option<TrustedKeys>) -> Result<Self, Failure> {
+        self.system.required_signers = signers;
+        Ok(self)
     }
 
     /// The simulator's truth of an object.

@@ -8,6 +8,7 @@ use vergence_devices::{
 };
 use vergence_head::PanTiltHead;
 use vergence_imaging::Frame;
+use vergence_tag::signature::TrustedKeys;
 
 /// How often moving servos are asked whether they are still.
 const POLL: Duration = Duration::from_millis(10);
@@ -37,6 +38,8 @@ pub struct System {
     pub robot: Robot,
     /// Left and right head: kinematics in the base frame and the camera's lens.
     pub heads: [PanTiltHead; 2],
+    /// Whose signature a record must bear; without, unsigned records do as well.
+    pub required_signers: Option<TrustedKeys>,
 }
 
 impl System {
@@ -54,7 +57,8 @@ impl System {
                 .map(|chain| PanTiltHead { chain, camera: wiring.camera.model() })
                 .map_err(|source| SystemError::Description { side: side.name(), source })
         };
-        Ok(System { robot, heads: [head(Side::Left)?, head(Side::Right)?] })
+        let heads = [head(Side::Left)?, head(Side::Right)?];
+        Ok(System { robot, heads, required_signers: None })
     }
 
     /// Reads the encoders of both heads.
