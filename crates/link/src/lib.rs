@@ -10,6 +10,7 @@
 //! is refused. Links are ended after use, but held while a tag's light plays.
 
 mod central;
+mod conversation;
 mod ears;
 mod flash;
 mod hci;
