@@ -57,6 +57,12 @@ pub fn open(config: &Config, description: &Description, folder: &Path) -> Result
             "`vergence sim` offers simulated tags to the radio driver \"hci\"",
         ));
     }
+    if config.arm.is_some() {
+        return Err(Failure::misuse(
+            "the heads are real and the arm is simulated",
+            "leave the table [arm] out: the robot then finds but does not grasp",
+        ));
+    }
     // The radio first: it needs no time to warm up, and fails soonest when the wiring is wrong.
     let radio = radio::open(config, folder)?;
     let [left, right] = servos(config, description, clock)?;
@@ -68,7 +74,7 @@ pub fn open(config: &Config, description: &Description, folder: &Path) -> Result
     let until = |device: DynamixelPanTilt| Until { interrupt: interrupt.clone(), device };
     let heads =
         [head(Side::Left, Box::new(until(left)))?, head(Side::Right, Box::new(until(right)))?];
-    Ok(Robot { clock: Box::new(clock), heads, radio: Box::new(radio.link) })
+    Ok(Robot { clock: Box::new(clock), heads, radio: Box::new(radio.link), arm: None })
 }
 
 /// The servos of both heads.

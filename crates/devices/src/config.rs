@@ -68,6 +68,10 @@ pub struct Config {
     pub right: HeadConfig,
     /// Tag radio.
     pub radio: RadioConfig,
+    /// The arm; without it the robot finds but does not grasp. The URDF's links `hand` and `tcp`
+    /// are its gripper and the point midway between the fingertips.
+    #[serde(default)]
+    pub arm: Option<DriverConfig>,
     /// The simulated workcell's own table, read by the simulator.
     #[serde(default)]
     pub sim: Option<toml::Table>,
@@ -143,6 +147,14 @@ pub struct ServosConfig {
     /// For the driver `dynamixel`.
     #[serde(default)]
     pub dynamixel: Option<DynamixelConfig>,
+}
+
+/// A device that needs no more than a driver's name.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DriverConfig {
+    /// Driver name.
+    pub driver: String,
 }
 
 /// The tag radio's driver. The driver `hci` needs to know where its controller is: `tcp` or `device`.

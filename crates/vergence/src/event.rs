@@ -1,7 +1,9 @@
 //! What happens during a run, for progress, pictures and recordings.
 
+use std::time::Duration;
+
 use vergence_devices::{Advertisement, JointReading, LedCommand, Side, TagAddress};
-use vergence_geometry::GaussianPoint;
+use vergence_geometry::{GaussianPoint, Trajectory};
 use vergence_imaging::Frame;
 use vergence_landmark::Sighting;
 use vergence_pose::{ObjectPose, Query, Refusal, View};
@@ -29,6 +31,15 @@ pub enum Event<'a> {
     Centred(Side, JointReading, &'a Sighting),
     /// The triangulated landmark and the distance by equation (1) of the paper.
     Landmark(&'a GaussianPoint, f64),
+    /// The arm is about to move.
+    Motion {
+        /// When (robot's clock).
+        start: Duration,
+        /// The arm's joints.
+        names: &'a [String; 6],
+        /// What it is told.
+        trajectory: &'a Trajectory,
+    },
     /// The recogniser has seen these views and decided.
     Recognised(&'a [View<'a>], &'a Query<'a>, Result<&'a ObjectPose, &'a Refusal>),
 }

@@ -72,6 +72,8 @@ impl Saver {
 
     fn saw(&mut self, event: &Event<'_>) {
         match event {
+            // Each step's pictures are explained by themselves.
+            Event::Begun(_) => self.watched = Default::default(),
             Event::Frame(side, frame, _) => {
                 let frames = &mut self.watched[*side as usize];
                 if frames.len() < MOST_FRAMES {

@@ -18,6 +18,7 @@
 //! Memory is a window of frames of constant length. The mathematics is that of `docs/landmark.md`.
 
 pub mod evidence;
+pub mod explain;
 pub mod front;
 pub mod history;
 pub mod motion;
@@ -31,6 +32,7 @@ mod verdict;
 
 use std::time::Duration;
 
+use nalgebra::Point2;
 use vergence_imaging::{Frame, Image};
 use vergence_tag::Pattern;
 
@@ -41,7 +43,7 @@ use history::{History, Past};
 use motion::{Placement, Reference};
 use nuisance::{Lamps, Nuisance, STILL_PX};
 use places::Places;
-use scan::{BlockNoise, Candidate, Family};
+use scan::{BlockNoise, Candidate, Family, Strong};
 use verdict::{Banks, Round};
 
 /// Settings of the sequential finder.
@@ -100,6 +102,8 @@ pub struct SequentialFinder {
     noise: BlockNoise,
     lamps: Lamps,
     places: Places,
+    /// Places that varied more than the noise explains when last looked.
+    restless: Vec<Point2<f64>>,
     banks: Banks,
     decisions: Vec<Decision>,
     frames: usize,
@@ -124,6 +128,7 @@ impl SequentialFinder {
             noise: BlockNoise::default(),
             lamps: Lamps::default(),
             places: Places::default(),
+            restless: Vec::new(),
             frames: 0,
             next_scan: FIRST_SCAN,
             size: (0, 0),
@@ -150,7 +155,10 @@ impl SequentialFinder {
             self.places.renew(candidates, KEEP * self.presence());
         }
         if scan || self.frames <= FIRST_SCAN || self.frames.is_multiple_of(STRONG_EVERY) {
-            for pixel in scan::by_energy(energy, width, height, n, &self.noise) {
+            let strong = scan::by_energy(energy, width, height, n, &self.noise);
+            let point = |s: &Strong| Point2::new(s.pixel.0 as f64, s.pixel.1 as f64);
+            self.restless = strong.iter().filter(|s| s.restless).map(point).collect();
+            for Strong { pixel, .. } in strong.into_iter().take(scan::BY_ENERGY) {
                 self.places.add(pixel, 0..self.requests.len());
             }
         }
@@ -158,6 +166,8 @@ impl SequentialFinder {
             return;
         }
         let nuisance = Nuisance::of(&self.history, &self.lamps);
+        let known =
+            self.decisions.iter().filter_map(Decision::brightest).map(|s| s.pixel).collect();
         let round = Round {
             requests: &self.requests,
             config: &self.config,
@@ -167,6 +177,8 @@ impl SequentialFinder {
             frames: self.frames,
             stamp,
             size: self.size,
+            restless: &self.restless,
+            known,
         };
         let places = self.places.as_mut_slice();
         round.decide(places, &mut self.banks, last, &mut self.decisions);
@@ -214,6 +226,14 @@ fn families(requests: &[Request]) -> Vec<Vec<usize>> {
     families
 }
 
+/// Registers and filters a frame.
+fn past(reference: &mut Reference, frame: &Frame, time: f64, reuse: Option<Image<i16>>) -> Past {
+    let mut placement = reference.place(&frame.image);
+    placement.row_gain = nuisance::smoothed(&placement.row_gain);
+    let filtered = still(front::filter(&frame.image, reuse), &placement);
+    Past { time, exposure: frame.exposure.as_secs_f64(), placement, filtered }
+}
+
 /// The filtered frame, moved back to where the first frame lay.
 fn still(filtered: Image<i16>, placement: &Placement) -> Image<i16> {
     if placement.dx.hypot(placement.dy) < STILL_PX {
@@ -226,15 +246,12 @@ impl Finder for SequentialFinder {
     fn push(&mut self, frame: &Frame) -> Result<(), FinderError> {
         let time = self.sequence.accept(frame)?;
         self.size = (frame.image.width(), frame.image.height());
-        let mut placement = self.reference.place(&frame.image);
-        placement.row_gain = nuisance::smoothed(&placement.row_gain);
-        let filtered = still(front::filter(&frame.image, self.spare.take()), &placement);
+        let past = past(&mut self.reference, frame, time, self.spare.take());
         let pixels = self.size.0 * self.size.1;
         let window = self.config.window_frames;
         let variation = self.variation.get_or_insert_with(|| Variation::new(pixels, window));
-        variation.push(filtered.data());
-        let exposure = frame.exposure.as_secs_f64();
-        self.spare = self.history.push(Past { time, exposure, placement, filtered });
+        variation.push(past.filtered.data());
+        self.spare = self.history.push(past);
         self.frames += 1;
         if self.frames >= FIRST_FRAMES {
             let scan = self.frames >= self.next_scan;

@@ -32,16 +32,17 @@ impl Nuisance {
         let n = history.len();
         let mut nuisance = Nuisance { basis: Vec::new(), frames: n };
         nuisance.add(vec![1.0; n]);
-        if n < DRIFT_FRAMES {
-            return nuisance;
+        if n >= DRIFT_FRAMES {
+            nuisance.add(history.frames().iter().map(|p| p.time as f32).collect());
         }
-        nuisance.add(history.frames().iter().map(|p| p.time as f32).collect());
         if history.shake() > STILL_PX {
             nuisance.add(history.frames().iter().map(|p| p.placement.dx as f32).collect());
             nuisance.add(history.frames().iter().map(|p| p.placement.dy as f32).collect());
         }
         for strengths in &lamps.strengths {
-            nuisance.add(history.frames().iter().map(|p| dot(&p.placement.row_gain, strengths)).collect());
+            nuisance.add(
+                history.frames().iter().map(|p| dot(&p.placement.row_gain, strengths)).collect(),
+            );
         }
         nuisance
     }

@@ -23,7 +23,7 @@ const PER_FAMILY: (usize, usize) = (24, 4);
 const MOST_PER_FAMILY: usize = 96;
 
 /// Places that go on for their energy alone.
-const BY_ENERGY: usize = 48;
+pub const BY_ENERGY: usize = 48;
 
 /// Distance from the border (px) within which nothing is looked for.
 pub const MARGIN: usize = 4;
@@ -96,14 +96,24 @@ pub struct Candidate {
     pub requests: Vec<usize>,
 }
 
-/// Pixels that vary far more than their block: strong lights, found without waiting for a scan.
+/// A pixel that varies far more than its block.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Strong {
+    /// Column and row in the first frame.
+    pub pixel: (usize, usize),
+    /// Whether chance would not explain it in any picture.
+    pub restless: bool,
+}
+
+/// Pixels that vary far more than their block: strong lights, found without waiting for a scan, and
+/// whatever else is restless; most outstanding first.
 pub fn by_energy(
     energy: &[f32],
     width: usize,
     height: usize,
     frames: usize,
     noise: &BlockNoise,
-) -> Vec<(usize, usize)> {
+) -> Vec<Strong> {
     // Five standard deviations of the chi-square above its mean.
     let limit = chi_square(frames, 5.0);
     let mut limits = vec![0.0; width];
@@ -125,8 +135,17 @@ pub fn by_energy(
         }
     }
     found.sort_by(|a, b| b.0.total_cmp(&a.0));
-    found.truncate(BY_ENERGY);
-    found.into_iter().map(|(_, pixel)| pixel).collect()
+    let certain = certain(frames) / limit;
+    let strong = |(excess, pixel)| Strong { pixel, restless: excess > certain };
+    found.into_iter().map(strong).collect()
+}
+
+/// What noise of unit variance adds up to by chance once in three million times (Wilson and
+/// Hilferty's cube for the chi-square, at five standard deviations).
+fn certain(frames: usize) -> f32 {
+    let freedom = frames.saturating_sub(1).max(1) as f32;
+    let spread = 2.0 / (9.0 * freedom);
+    freedom * (1.0 - spread + 5.0 * spread.sqrt()).powi(3)
 }
 
 /// What noise of unit variance adds up to over so many frames, and `above` standard deviations more.
@@ -245,9 +264,6 @@ fn peaks(energy: &[f32], width: usize, y: usize, limits: &[f32], columns: &mut V
     let inside: Range<usize> = MARGIN..width - MARGIN;
     columns.extend(inside.filter(|&x| {
         let e = here[x];
-        e > limits[x]
-            && e >= here[x - 1]
-            && e > here[x + 1]
-            && is_peak([above, here, below], x)
+        e > limits[x] && e >= here[x - 1] && e > here[x + 1] && is_peak([above, here, below], x)
     }));
 }

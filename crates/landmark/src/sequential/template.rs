@@ -124,8 +124,7 @@ impl Bank {
             self.used = 0..used.len();
         }
         let at = self.used.end;
-        for (h, light) in
-            self.hypotheses.iter().zip(self.templates.chunks_exact_mut(self.capacity))
+        for (h, light) in self.hypotheses.iter().zip(self.templates.chunks_exact_mut(self.capacity))
         {
             for (value, &(t, e)) in light[at..].iter_mut().zip(new) {
                 *value = self.pattern.on_fraction(h.phase + h.rate * t, h.rate * e) as f32;
@@ -200,9 +199,8 @@ pub fn lines(patterns: &[&Pattern], times: &[(f64, f64)], nuisance: &Nuisance) -
     for (k, _) in strengths.iter().enumerate().filter(|(_, s)| **s > 0.3) {
         for quarter in [0.0, 0.25] {
             // The middle of the exposure is where a line's phase is read.
-            let angle = |&(t, e): &(f64, f64)| {
-                TAU * ((k + 1) as f64 * (t + 0.5 * e) / period + quarter)
-            };
+            let angle =
+                |&(t, e): &(f64, f64)| TAU * ((k + 1) as f64 * (t + 0.5 * e) / period + quarter);
             let mut line: Vec<f32> = times.iter().map(|t| angle(t).cos() as f32).collect();
             nuisance.remove(&mut line);
             for other in &set {

@@ -14,7 +14,7 @@ use std::time::Duration;
 use nalgebra::{Matrix2, Point2};
 
 use super::Config;
-use super::evidence::{Evidence, Series, refine, unexplained, weigh};
+use super::evidence::{Evidence, Series, refine, refined_gain, unexplained, weigh};
 use super::front::{BLOB_VARIANCE, BOX_SHARE};
 use super::history::{History, noise_share};
 use super::nuisance::{Nuisance, dot};
@@ -27,8 +27,9 @@ use crate::{Decision, Request, Sighting};
 /// Changes of the light that must have been seen: one more than a passing thing and its shadow make.
 const TRANSITIONS: f64 = 5.0;
 
-/// Share of the explained energy that may stay unexplained beyond the noise.
-const MISFIT: f64 = 0.35;
+/// Share of the explained energy that may stay unexplained beyond the noise: what phase, saturation,
+/// shake and JPEG leave of a tag's light is below a twentieth, a foreign code leaves more than a tenth.
+const MISFIT: f64 = 0.1;
 
 /// Factor on the noise of the neighbourhood before anything counts as unexplained.
 const NOISE_SLACK: f64 = 1.5;
@@ -48,6 +49,10 @@ const FOREIGN: [f64; 6] = [1.0, 1.5, 2.0, 3.0, 4.0, 6.0];
 /// Systematic part of a position's standard deviation (px): a light is no perfect point.
 const FLOOR_PX: f64 = 0.02;
 
+/// Restless places to reckon with where the picture shows none but the one in question: so many in so
+/// many pixels.
+const UNSEEN: (f64, f64) = (0.005, 640.0 * 480.0);
+
 /// Share of the presence threshold from which a pixel is looked at closer: the rest may be lost
 /// between pixels.
 const CLOSER: f64 = 0.5;
@@ -62,6 +67,10 @@ pub struct Round<'a> {
     pub frames: usize,
     pub stamp: Duration,
     pub size: (usize, usize),
+    /// Places that vary more than the noise around explains.
+    pub restless: &'a [Point2<f64>],
+    /// Places of the lights that are known.
+    pub known: Vec<Point2<f64>>,
 }
 
 /// A place with the evidence for one request.
@@ -112,11 +121,7 @@ impl Banks {
 }
 
 /// The bank of a slot, brought up to the window of this round.
-fn fitted<'a>(
-    slot: &'a mut Option<Bank>,
-    round: &Round,
-    new: impl FnOnce() -> Bank,
-) -> &'a Bank {
+fn fitted<'a>(slot: &'a mut Option<Bank>, round: &Round, new: impl FnOnce() -> Bank) -> &'a Bank {
     let bank = slot.get_or_insert_with(new);
     bank.fit(round.history.times(), round.history.numbers(), round.nuisance);
     bank
@@ -129,10 +134,42 @@ pub fn presence(size: (usize, usize), requests: usize, false_alarm: f64) -> f64 
     (cells * requests as f64 / false_alarm).ln()
 }
 
+/// Log likelihood ratio by which each of so many other explanations must be beaten.
+pub fn margin(others: usize, wrong_identity: f64) -> f64 {
+    (others.max(1) as f64 / wrong_identity).ln()
+}
+
 impl Round<'_> {
     /// Log likelihood ratio that presence needs.
     fn presence(&self) -> f64 {
         presence(self.size, self.requests.len(), self.config.false_alarm)
+    }
+
+    /// Whether a place passes if it is one of those that vary more than the noise around explains.
+    /// They are few, but nothing is known of how they vary: with a noise of their own, or as a light
+    /// that blinks some other code.
+    fn stands_if_restless(&self, request: usize, seen: &Seen) -> bool {
+        // Places close by may be ghosts of this one, and a light that is known already is no riddle.
+        let far = |a: &Point2<f64>, b: &Point2<f64>| (a - b).norm() > GHOST.0;
+        let others = self.restless.iter().filter(|p| far(p, &seen.place));
+        let unknown = others.filter(|p| self.known.iter().all(|k| far(p, k))).count() as f64;
+        let requests = self.requests.len() as f64;
+        let area = (self.size.0 * self.size.1) as f64 / UNSEEN.1;
+        let chances = (unknown + UNSEEN.0 * area) * requests / self.config.false_alarm;
+        if seen.evidence.restless < chances.ln() {
+            return false;
+        }
+        // A code of random chips looks like this pattern at one of its phases by chance; what is
+        // projected out cannot speak against it.
+        let pattern = &self.requests[request].pattern;
+        let times = self.history.times();
+        let span = times.last().map_or(0.0, |l| l.0) - times.first().map_or(0.0, |f| f.0);
+        let frames = times.len() as f64;
+        let chips = (span / pattern.chip.as_secs_f64() + 1.0).min(frames);
+        let left = chips * seen.series.freedom / frames;
+        let phases = pattern.bits.len() as f64;
+        let foreign = unknown.clamp(UNSEEN.0, 1.0);
+        left >= (foreign * requests * phases / self.config.wrong_identity).log2()
     }
 
     /// Log likelihood ratio from which a pixel is looked at closer.
@@ -142,7 +179,7 @@ impl Round<'_> {
 
     /// Log likelihood ratio by which another explanation must be beaten.
     fn margin(&self, others: usize) -> f64 {
-        (others.max(1) as f64 / self.config.wrong_identity).ln()
+        margin(others, self.config.wrong_identity)
     }
 
     /// Frame count at which a place of this evidence is worth another look: evidence grows by its
@@ -320,7 +357,8 @@ impl Round<'_> {
             }
         }
         for _ in 0..2 {
-            evidence = refine(&series, pattern, self.history.times(), self.nuisance, evidence, step);
+            evidence =
+                refine(&series, pattern, self.history.times(), self.nuisance, evidence, step);
             let best = (evidence.best.phase, evidence.best.rate);
             series.expect(pattern, self.history.times(), best, self.nuisance, &mut expected);
             let moved = self.peak(place, &expected, &mut raw);
@@ -371,7 +409,7 @@ impl Round<'_> {
     /// Presence, quality of the fit, margins.
     fn stands(&self, request: usize, seen: &Seen, banks: &mut Banks) -> bool {
         let (own, series) = (seen.evidence, &seen.series);
-        if own.log_ratio < self.presence() {
+        if own.log_ratio < self.presence() || !self.stands_if_restless(request, seen) {
             return false;
         }
         let rest = unexplained(series, &own) - NOISE_SLACK * series.freedom * series.noise;
@@ -382,9 +420,14 @@ impl Round<'_> {
         let others = self.requests.len() - 1;
         for other in (0..self.requests.len()).filter(|o| *o != request) {
             let limit = own.log_ratio - self.margin(others);
-            match weigh(series, banks.own(self, other), limit, &mut scratch) {
-                Some(evidence) if evidence.log_ratio > limit => return false,
-                _ => {}
+            let bank = banks.own(self, other);
+            let Some(rival) = weigh(series, bank, 0.0, &mut scratch) else { continue };
+            // A strong light tells phases apart that the bank does not have.
+            let pattern = &self.requests[other].pattern;
+            let times = self.history.times();
+            let gain = refined_gain(series, pattern, times, self.nuisance, rival, bank.step);
+            if rival.log_ratio + gain > limit {
+                return false;
             }
         }
         let Some(rate) = self.config.foreign_rate else { return true };

@@ -200,10 +200,24 @@ fn tag_free(minutes: f64) -> Result<TagFree, Failure> {
 /// One tag-free scene: everything at once, differently in every run.
 fn hostile(run: usize, side: usize, requests: &[Request]) -> Scene {
     let at = |purpose: u64| 12.0 + draw(run, purpose) * (side as f64 - 24.0);
-    // Foreign tags: other codes, and requested patterns played at least 6 % too fast or too slow.
+    // Foreign tags: another code, and a requested pattern played at least 6 % too fast or too slow, and
+    // not at the rate of another requested one either.
     let other = requests[(draw(run, 11) * requests.len() as f64) as usize].pattern;
-    let rate =
-        if draw(run, 12) < 0.5 { 0.70 + 0.24 * draw(run, 13) } else { 1.06 + 0.3 * draw(run, 13) };
+    let off = |k: u64| {
+        if draw(run, 12 + 100 * k) < 0.5 {
+            0.70 + 0.24 * draw(run, 13 + 100 * k)
+        } else {
+            1.06 + 0.3 * draw(run, 13 + 100 * k)
+        }
+    };
+    let chip = other.chip.as_secs_f64();
+    let alike = |rate: &f64| {
+        requests.iter().filter(|r| r.pattern.bits == other.bits).any(|r| {
+            let ratio = chip / rate / r.pattern.chip.as_secs_f64();
+            (0.95..1.05).contains(&ratio)
+        })
+    };
+    let rate = (0..).map(off).find(|rate| !alike(rate)).unwrap_or(1.5);
     let foreign = codebook::challenge(
         run as u64,
         Duration::from_millis(33),
