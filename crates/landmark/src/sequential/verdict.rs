@@ -21,7 +21,7 @@ use super::nuisance::{Nuisance, dot};
 use super::places::{Place, Watch};
 use super::scan::{BlockNoise, MARGIN};
 use super::surroundings::intruders;
-use super::template::{Bank, rates, transitions};
+use super::template::{Bank, every_line, rates, transitions};
 use crate::{Decision, Request, Sighting};
 
 /// Changes of the light that must have been seen: one more than a passing thing and its shadow make.
@@ -30,6 +30,12 @@ const TRANSITIONS: f64 = 5.0;
 /// Share of the explained energy that may stay unexplained beyond the noise: what phase, saturation,
 /// shake and JPEG leave of a tag's light is below a twentieth, a foreign code leaves more than a tenth.
 const MISFIT: f64 = 0.1;
+
+/// Standard deviations of chance by which another code must fit better to be believed.
+const CHANCE: f64 = 4.0;
+
+/// Degrees of freedom from which what is left over tells the noise.
+const FREE: f64 = 10.0;
 
 /// Factor on the noise of the neighbourhood before anything counts as unexplained.
 const NOISE_SLACK: f64 = 1.5;
@@ -52,6 +58,9 @@ const FLOOR_PX: f64 = 0.02;
 /// Restless places to reckon with where the picture shows none but the one in question: so many in so
 /// many pixels.
 const UNSEEN: (f64, f64) = (0.005, 640.0 * 480.0);
+
+/// Foreign codes to reckon with in a picture, however many places are restless.
+const MOST_FOREIGN: f64 = 4.0;
 
 /// Share of the presence threshold from which a pixel is looked at closer: the rest may be lost
 /// between pixels.
@@ -168,7 +177,7 @@ impl Round<'_> {
         let chips = (span / pattern.chip.as_secs_f64() + 1.0).min(frames);
         let left = chips * seen.series.freedom / frames;
         let phases = pattern.bits.len() as f64;
-        let foreign = unknown.clamp(UNSEEN.0, 1.0);
+        let foreign = unknown.clamp(UNSEEN.0, MOST_FOREIGN);
         left >= (foreign * requests * phases / self.config.wrong_identity).log2()
     }
 
@@ -416,6 +425,9 @@ impl Round<'_> {
         if rest > MISFIT * own.correlation * own.correlation {
             return false;
         }
+        if self.is_another_code(request, seen) {
+            return false;
+        }
         let mut scratch = Vec::new();
         let others = self.requests.len() - 1;
         for other in (0..self.requests.len()).filter(|o| *o != request) {
@@ -435,6 +447,25 @@ impl Round<'_> {
         let limit = own.log_ratio - self.margin(bank.hypotheses.len());
         let foreign = weigh(series, bank, limit, &mut scratch);
         foreign.is_none_or(|evidence| evidence.log_ratio <= limit)
+    }
+
+    /// Whether some other code of the same length and chip would fit much better: any such code lies in
+    /// the span of the lines of its period.
+    fn is_another_code(&self, request: usize, seen: &Seen) -> bool {
+        let (own, series) = (&seen.evidence, &seen.series);
+        let pattern = &self.requests[request].pattern;
+        let lines = every_line(pattern, self.history.times(), |line| {
+            series.clear(self.nuisance, line);
+        });
+        let free = series.freedom - lines.len() as f64;
+        let any: f64 = lines.iter().map(|l| f64::from(dot(l, &series.values)).powi(2)).sum();
+        let explained = own.correlation * own.correlation;
+        // The noise is what even the freest code leaves, as far as that can be told.
+        let rest = (series.energy - any).max(0.0);
+        let noise = if free > FREE { rest / free } else { NOISE_SLACK * series.noise };
+        let chance = (lines.len() as f64 - 1.0).max(1.0);
+        let better = any - explained - chance * noise;
+        better > (MISFIT * explained).max(CHANCE * (2.0 * chance).sqrt() * noise)
     }
 
     fn sighting(&self, request: usize, seen: &Seen, pixel: Point2<f64>) -> Sighting {
