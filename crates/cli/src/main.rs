@@ -9,6 +9,7 @@ mod commands;
 mod drivers;
 mod failure;
 mod interrupt;
+mod light;
 mod output;
 mod progress;
 mod radio;

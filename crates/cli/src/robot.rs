@@ -15,6 +15,9 @@ use crate::drivers::{self, HCI, SIM};
 use crate::failure::Failure;
 use crate::radio::{self, Radio};
 
+/// Key of `[sim]` for [`built`].
+pub const BUILT: &str = "built";
+
 /// Which robot.
 #[derive(Args, Clone, Default)]
 pub struct RobotArgs {
@@ -59,13 +62,12 @@ impl RobotArgs {
                     let devices = drivers::open(&config, &description, folder(path))?;
                     return Opened::wired(config, description, devices);
                 }
-                let workcell = Workcell::from_config(&config, &description, self.seed);
-                let workcell = workcell.map_err(unusable)?;
+                let workcell = self.workcell(path, &config, &description)?;
                 let mut devices = workcell.robot();
                 if config.radio.driver == HCI {
                     devices.radio = Box::new(radio::open(&config, folder(path))?.link);
                 }
-                Opened::new(workcell, devices)
+                Opened::new(workcell, devices, config, description)
             }
             None => Opened::embedded(self.seed, Scenario::Default),
         }
@@ -74,7 +76,13 @@ impl RobotArgs {
     /// What a simulated workcell is made of: the configuration's, else the embedded one's.
     pub fn simulation(&self) -> Result<(Config, Description, SimConfig), Failure> {
         let (config, description) = match &self.config {
-            Some(path) => read(path)?,
+            Some(path) => {
+                let (config, description) = read(path)?;
+                match built(path, &config)? {
+                    Some(other) => read(&other)?,
+                    None => (config, description),
+                }
+            }
             None => vergence_sim::embedded_files().map_err(unusable)?,
         };
         let settings = vergence_sim::settings(&config).map_err(unusable)?;
@@ -90,11 +98,29 @@ impl RobotArgs {
                 if config.radio.driver == HCI {
                     return radio::open(&config, folder(path));
                 }
+                self.workcell(path, &config, &description)?
+            }
+            None => Workcell::embedded(self.seed).map_err(unusable)?,
+        };
+        Ok(Radio::simulated(&workcell))
+    }
+
+    /// The simulated workcell of a configuration. A calibrated configuration names the one from which
+    /// the head was built, which stays as it is whatever is now believed of it.
+    fn workcell(
+        &self,
+        path: &Path,
+        config: &Config,
+        description: &Description,
+    ) -> Result<Workcell, Failure> {
+        let workcell = match built(path, config)? {
+            Some(other) => {
+                let (config, description) = read(&other)?;
                 Workcell::from_config(&config, &description, self.seed)
             }
-            None => Workcell::embedded(self.seed),
+            None => Workcell::from_config(config, description, self.seed),
         };
-        Ok(Radio::simulated(&workcell.map_err(unusable)?))
+        workcell.map_err(unusable)
     }
 }
 
@@ -103,7 +129,8 @@ impl Opened {
     pub fn embedded(seed: u64, scenario: Scenario) -> Result<Self, Failure> {
         let workcell = Workcell::embedded_as(scenario, seed).map_err(unusable)?;
         let devices = workcell.robot();
-        Self::new(workcell, devices)
+        let (config, description) = (workcell.config().clone(), workcell.description().clone());
+        Self::new(workcell, devices, config, description)
     }
 
     /// A robot whose devices are not the simulator's.
@@ -112,11 +139,20 @@ impl Opened {
         Ok(Opened { system, config, description, workcell: None, bench: None })
     }
 
-    fn new(workcell: Workcell, devices: Robot) -> Result<Self, Failure> {
-        let (config, description) = (workcell.config().clone(), workcell.description().clone());
+    fn new(
+        workcell: Workcell,
+        devices: Robot,
+        config: Config,
+        description: Description,
+    ) -> Result<Self, Failure> {
         let system = System::new(devices, &config, &description).map_err(unusable)?;
         let workcell = Some(Arc::new(workcell));
         Ok(Opened { system, config, description, workcell, bench: None })
+    }
+
+    /// The simulator, when it serves the devices.
+    pub fn simulator(&self) -> Option<Arc<Workcell>> {
+        self.workcell.clone()
     }
 
     /// Gives the robot its arm, when it has one: contacts are simulated around one object. With
@@ -186,6 +222,15 @@ fn read(path: &Path) -> Result<(Config, Description), Failure> {
 /// The folder that a configuration's paths are relative to.
 fn folder(path: &Path) -> &Path {
     path.parent().unwrap_or(Path::new(""))
+}
+
+/// The configuration that a calibrated one of the simulated workcell was made from: `[sim] built`.
+fn built(path: &Path, config: &Config) -> Result<Option<PathBuf>, Failure> {
+    let Some(named) = config.sim.as_ref().and_then(|sim| sim.get(BUILT)) else { return Ok(None) };
+    match named.as_str() {
+        Some(name) => Ok(Some(folder(path).join(name))),
+        None => Err(Failure::misuse("[sim] built is not a path", "calibrate anew")),
+    }
 }
 
 /// Refuses drivers of radio and arm that do not exist.

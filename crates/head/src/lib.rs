@@ -26,7 +26,7 @@ mod search;
 mod triangulation;
 
 pub use calibration::{Calibration, CalibrationConfig, calibrate};
-pub use fixation::{Fixator, FixatorConfig, NextMove, dither};
+pub use fixation::{Fixator, FixatorConfig, NextMove, dither, run_up};
 pub use kinematics::{HeadError, PanTiltHead};
 pub use paper::{PaperAngles, paper_distance};
 pub use search::{Field, Search, SearchConfig};

@@ -22,8 +22,11 @@ use crate::system::System;
 
 mod blink;
 mod centre;
+mod collect;
 mod reaim;
 mod search;
+
+pub use collect::{CollectConfig, CollectError, LightMover, Placed, Session, collect};
 
 /// Which recognition is used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

@@ -2,6 +2,7 @@
 //! variant of [`Command`] and a line in [`run`].
 
 mod blink;
+mod calibrate;
 mod evaluate;
 mod experiment;
 mod find;
@@ -33,6 +34,8 @@ pub enum Command {
     Evaluate(evaluate::Evaluate),
     /// Write the built-in workcell to a folder, to edit and use with --config.
     Workcell(workcell::Workcell),
+    /// Calibrate the heads from a blinking light.
+    Calibrate(calibrate::Calibrate),
     /// Offer the simulated workcell's devices over the wires of real ones.
     Sim(sim::Sim),
     /// Find blinking landmarks in a recording.
@@ -51,6 +54,7 @@ pub fn run(command: Command) -> Result<bool, Failure> {
         Command::Experiment(args) => experiment::run(&args),
         Command::Evaluate(args) => evaluate::run(args),
         Command::Workcell(args) => workcell::run(&args),
+        Command::Calibrate(args) => calibrate::run(&args),
         Command::Sim(args) => sim::run(&args),
         Command::Blink(args) => blink::run(args),
         Command::Pose(args) => pose::run(args),

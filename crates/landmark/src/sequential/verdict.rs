@@ -49,9 +49,9 @@ const FOREIGN: [f64; 6] = [1.0, 1.5, 2.0, 3.0, 4.0, 6.0];
 /// Systematic part of a position's standard deviation (px): a light is no perfect point.
 const FLOOR_PX: f64 = 0.02;
 
-/// Restless places to reckon with, for every pixel, where the picture shows none but the one in
-/// question: one in a hundred pictures of 640x480.
-const UNSEEN: f64 = 0.01 / (640.0 * 480.0);
+/// Restless places to reckon with where the picture shows none but the one in question: so many in so
+/// many pixels.
+const UNSEEN: (f64, f64) = (0.005, 640.0 * 480.0);
 
 /// Share of the presence threshold from which a pixel is looked at closer: the rest may be lost
 /// between pixels.
@@ -134,21 +134,42 @@ pub fn presence(size: (usize, usize), requests: usize, false_alarm: f64) -> f64 
     (cells * requests as f64 / false_alarm).ln()
 }
 
+/// Log likelihood ratio by which each of so many other explanations must be beaten.
+pub fn margin(others: usize, wrong_identity: f64) -> f64 {
+    (others.max(1) as f64 / wrong_identity).ln()
+}
+
 impl Round<'_> {
     /// Log likelihood ratio that presence needs.
     fn presence(&self) -> f64 {
         presence(self.size, self.requests.len(), self.config.false_alarm)
     }
 
-    /// Log likelihood ratio that presence needs over places that vary more than the noise around
-    /// explains: they are few, but nothing is known of how they vary. Places close by may be ghosts of
-    /// this one, and a light that is known already is not restless.
-    fn presence_if_restless(&self, place: Point2<f64>) -> f64 {
+    /// Whether a place passes if it is one of those that vary more than the noise around explains.
+    /// They are few, but nothing is known of how they vary: with a noise of their own, or as a light
+    /// that blinks some other code.
+    fn stands_if_restless(&self, request: usize, seen: &Seen) -> bool {
+        // Places close by may be ghosts of this one, and a light that is known already is no riddle.
         let far = |a: &Point2<f64>, b: &Point2<f64>| (a - b).norm() > GHOST.0;
-        let others = self.restless.iter().filter(|p| far(p, &place));
-        let unknown = others.filter(|p| self.known.iter().all(|k| far(p, k))).count();
-        let expected = unknown as f64 + UNSEEN * (self.size.0 * self.size.1) as f64;
-        (expected * self.requests.len() as f64 / self.config.false_alarm).ln()
+        let others = self.restless.iter().filter(|p| far(p, &seen.place));
+        let unknown = others.filter(|p| self.known.iter().all(|k| far(p, k))).count() as f64;
+        let requests = self.requests.len() as f64;
+        let area = (self.size.0 * self.size.1) as f64 / UNSEEN.1;
+        let chances = (unknown + UNSEEN.0 * area) * requests / self.config.false_alarm;
+        if seen.evidence.restless < chances.ln() {
+            return false;
+        }
+        // A code of random chips looks like this pattern at one of its phases by chance; what is
+        // projected out cannot speak against it.
+        let pattern = &self.requests[request].pattern;
+        let times = self.history.times();
+        let span = times.last().map_or(0.0, |l| l.0) - times.first().map_or(0.0, |f| f.0);
+        let frames = times.len() as f64;
+        let chips = (span / pattern.chip.as_secs_f64() + 1.0).min(frames);
+        let left = chips * seen.series.freedom / frames;
+        let phases = pattern.bits.len() as f64;
+        let foreign = unknown.clamp(UNSEEN.0, 1.0);
+        left >= (foreign * requests * phases / self.config.wrong_identity).log2()
     }
 
     /// Log likelihood ratio from which a pixel is looked at closer.
@@ -158,7 +179,7 @@ impl Round<'_> {
 
     /// Log likelihood ratio by which another explanation must be beaten.
     fn margin(&self, others: usize) -> f64 {
-        (others.max(1) as f64 / self.config.wrong_identity).ln()
+        margin(others, self.config.wrong_identity)
     }
 
     /// Frame count at which a place of this evidence is worth another look: evidence grows by its
@@ -388,7 +409,7 @@ impl Round<'_> {
     /// Presence, quality of the fit, margins.
     fn stands(&self, request: usize, seen: &Seen, banks: &mut Banks) -> bool {
         let (own, series) = (seen.evidence, &seen.series);
-        if own.log_ratio < self.presence() || own.restless < self.presence_if_restless(seen.place) {
+        if own.log_ratio < self.presence() || !self.stands_if_restless(request, seen) {
             return false;
         }
         let rest = unexplained(series, &own) - NOISE_SLACK * series.freedom * series.noise;

@@ -163,7 +163,7 @@ impl Run<'_> {
     }
 }
 
-fn fixation(joints: &JointReading, sighting: &Sighting) -> Fixation {
+pub(super) fn fixation(joints: &JointReading, sighting: &Sighting) -> Fixation {
     Fixation {
         angles: [joints.pan, joints.tilt],
         pixel: sighting.pixel,

@@ -139,7 +139,7 @@ impl Run<'_> {
     }
 
     /// Where the camera is when the motor came from below.
-    fn camera_angles(&self, side: usize, reading: &JointReading) -> [f64; 2] {
+    pub(super) fn camera_angles(&self, side: usize, reading: &JointReading) -> [f64; 2] {
         let lag = LAG.0 * self.system.robot.heads[side].pan_tilt.backlash();
         [reading.pan - lag, reading.tilt - lag]
     }
