@@ -163,16 +163,23 @@ impl Opened {
         self.workcell.clone()
     }
 
-    /// Gives the robot its arm, when it has one: contacts are simulated around one object.
-    pub fn attach_arm(&mut self, object: &str) -> Result<(), Failure> {
+    /// Gives the robot its arm, when it has one: contacts are simulated around one object. With
+    /// `photographs` the stages are kept for [`Opened::save_grasp`].
+    pub fn attach_arm(&mut self, object: &str, photographs: bool) -> Result<(), Failure> {
         let (Some(workcell), Some(_)) = (&self.workcell, &self.config.arm) else { return Ok(()) };
-        let clock = workcell.robot().clock;
-        if let Some((arm, bench)) = bench::build(workcell, &self.description, object, clock)? {
+        let built = bench::build(workcell, &self.description, object, photographs)?;
+        if let Some((arm, bench)) = built {
             self.system.robot.arm = Some(Box::new(arm));
             self.system.hand = Some(bench::hand(&self.description)?);
             self.bench = Some(bench);
         }
         Ok(())
+    }
+
+    /// Writes the grasp as an onlooker saw it (`stages.png`) and for a second physics engine
+    /// (`replay.json`), in simulation.
+    pub fn save_grasp(&self, dir: &Path) -> Result<(), Failure> {
+        self.bench.as_ref().map_or(Ok(()), |bench| bench::lock(bench).save(dir))
     }
 
     /// The physics' verdict on what the arm did, in simulation.
