@@ -75,6 +75,17 @@ impl<F: NorFlash> Store<F> {
         Ok(stored.and_then(decode_bond))
     }
 
+    /// This very bond is kept.
+    pub async fn holds(&mut self, bond: &BondInformation) -> Result<bool, StoreError> {
+        let wanted = encode_bond(bond);
+        for index in 0..BONDS as u8 {
+            if self.get(FIRST_BOND_KEY + index).await? == Some(&wanted[..]) {
+                return Ok(true);
+            }
+        }
+        Ok(false)
+    }
+
     /// Keeps a bond: in the place of an older one of the same peer, else of the oldest.
     pub async fn add_bond(&mut self, bond: &BondInformation) -> Result<(), StoreError> {
         let mut place = None;

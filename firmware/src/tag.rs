@@ -17,7 +17,8 @@ use trouble_host::connection::Connection;
 use trouble_host::gatt::{GattConnection, GattConnectionEvent, GattEvent, WriteEvent};
 use trouble_host::peripheral::Peripheral;
 use trouble_host::{
-    Address, BleHostError, Controller, Error, HostResources, IoCapabilities, PacketPool, Stack,
+    Address, BleHostError, BondInformation, Controller, Error, HostResources, IoCapabilities,
+    PacketPool, Stack,
 };
 use vergence_tag::cbor::{self, MAX_BYTES};
 use vergence_tag::upload::crc32;
@@ -77,7 +78,7 @@ where
     B: Battery,
     W: Watchdog,
 {
-    let mut resources: HostResources<P, 1, 2, 1, BONDS> = HostResources::new();
+    let mut resources: HostResources<P, 1, 2, 1, { BONDS + 1 }> = HostResources::new();
     let io = match config.passkey {
         Some(_) => IoCapabilities::DisplayOnly,
         None => IoCapabilities::NoInputNoOutput,
@@ -179,7 +180,9 @@ impl<P: PacketPool, F: NorFlash, L: Lights, B: Battery, W: Watchdog> Tag<'_, '_,
         let Ok(connection) = connection.with_attribute_server(&self.server.attributes) else {
             return Ok(());
         };
-        if self.serve(&connection).await {
+        let ended = self.serve(&connection).await;
+        self.keep_bonds(stack).await;
+        if ended {
             return Ok(());
         }
         connection.raw().disconnect();
@@ -190,6 +193,24 @@ impl<P: PacketPool, F: NorFlash, L: Lights, B: Battery, W: Watchdog> Tag<'_, '_,
         };
         let _ = with_timeout(LONGEST_FAREWELL, self.fed(gone)).await;
         Ok(())
+    }
+
+    /// Makes store and stack agree on the bonds. A pairing is told by an event, which is lost when the
+    /// robot leaves at once; and the stack does not know which bond made room for a new one.
+    async fn keep_bonds<C: Controller>(&mut self, stack: &Stack<'_, Guard<C, 1>, P>) {
+        type Bonds = heapless::Vec<BondInformation, { BONDS + 1 }>;
+        let known = stack.with_bond_information(|bonds| bonds.iter().cloned().collect::<Bonds>());
+        for bond in known.iter().filter(|bond| bond.is_bonded) {
+            if !matches!(self.store.holds(bond).await, Ok(true)) {
+                // A bond that is not kept costs the robot another pairing.
+                let _ = self.store.add_bond(bond).await;
+            }
+        }
+        for bond in &known {
+            if let Ok(false) = self.store.holds(bond).await {
+                let _ = stack.remove_bond_information(bond.identity);
+            }
+        }
     }
 
     /// Keeps the watchdog fed while something takes its time.
@@ -284,7 +305,7 @@ impl<P: PacketPool, F: NorFlash, L: Lights, B: Battery, W: Watchdog> Tag<'_, '_,
                     GattConnectionEvent::PairingComplete { bond, .. } => {
                         *pairing = Pairing::default();
                         if let Some(bond) = bond {
-                            // A bond that is not kept costs the robot another pairing.
+                            // At once: the power may fail before the link ends.
                             let _ = session.store.add_bond(&bond).await;
                         }
                     }

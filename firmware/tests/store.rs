@@ -160,6 +160,9 @@ fn bonds_are_kept_and_the_oldest_makes_room() {
     run(flash.store().add_bond(&bond(9))).unwrap();
     assert_eq!(bonds(&flash), [2, 3, 4, 5, 6, 7, 8, 9]);
     assert_eq!(run(flash.store().bond(1)).unwrap(), Some(bond(2)));
+    assert!(
+        run(flash.store().holds(&bond(9))).unwrap() && !run(flash.store().holds(&bond(1))).unwrap()
+    );
     run(flash.store().forget_bonds()).unwrap();
     assert_eq!(bonds(&flash), Vec::<u8>::new());
     assert_eq!(record(&mut flash.store()), [7; 100]);

@@ -22,6 +22,7 @@ mod link;
 mod medium;
 mod stream;
 pub mod time;
+mod user_channel;
 
 pub use controller::{Controller, TransportError};
 pub use executor::{Executor, Stalled, TaskId};

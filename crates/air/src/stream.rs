@@ -6,17 +6,21 @@
 
 use std::cell::RefCell;
 use std::collections::VecDeque;
+use std::fs::File;
 use std::future::poll_fn;
 use std::io::{self, Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
+use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Poll, Waker};
 
 use bt_hci_transport::{PacketToController, PacketToHost, Transport};
+use serial2::{FlowControl, SerialPort};
 
 use crate::controller::{TransportError, parse, serialise};
 use crate::hci::kind;
 use crate::medium::Air;
+use crate::user_channel;
 
 /// Reads one packet with its indicator; `None` at the end of the stream.
 fn read_packet(reader: &mut impl Read) -> io::Result<Option<Vec<u8>>> {
@@ -129,6 +133,43 @@ impl StreamTransport<TcpStream> {
         let mut transport = StreamTransport::new(stream.try_clone()?, stream);
         transport.socket = socket;
         Ok(transport)
+    }
+}
+
+impl StreamTransport<File> {
+    /// Takes over a Bluetooth controller of this computer (0 is `hci0`). It must be powered off and
+    /// left alone by bluetoothd; the caller needs CAP_NET_ADMIN.
+    pub fn user_channel(controller: u16) -> io::Result<Self> {
+        let (reader, writer) = user_channel::open(controller)?;
+        Ok(StreamTransport::new(reader, writer))
+    }
+}
+
+impl StreamTransport<SerialPort> {
+    /// A controller on a serial line (8 bits, no parity) with H4 at this speed (baud). Hardware flow
+    /// control is on, as the H4 transport layer demands.
+    pub fn serial(path: &Path, baud: u32) -> io::Result<Self> {
+        let port = SerialPort::open(path, |mut settings: serial2::Settings| {
+            settings.set_raw();
+            settings.set_flow_control(FlowControl::RtsCts);
+            settings.set_baud_rate(baud)?;
+            Ok(settings)
+        })?;
+        Ok(StreamTransport::new(Patient(port.try_clone()?), port))
+    }
+}
+
+/// A serial line that is quiet for long without being at its end.
+struct Patient(SerialPort);
+
+impl Read for Patient {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        loop {
+            match self.0.read(buffer) {
+                Err(error) if error.kind() == io::ErrorKind::TimedOut => {}
+                other => return other,
+            }
+        }
     }
 }
 

@@ -7,12 +7,14 @@
 
 mod arm;
 pub mod bodies;
+pub mod calibrated;
 pub mod clock;
 pub mod config;
 pub mod description;
 pub mod dynamixel;
 pub mod mjpeg;
 mod traits;
+pub mod v4l2;
 
 pub use arm::{Arm, ArmReading, Cancel, Execution, GripCommand, GripperReading, MotionLimits};
 pub use bodies::GripperJoints;

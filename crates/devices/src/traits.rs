@@ -6,6 +6,8 @@ use std::time::Duration;
 use vergence_imaging::Frame;
 use vergence_tag::Pattern;
 
+use crate::arm::Arm;
+
 /// What can go wrong with a device.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum DeviceError {
@@ -56,6 +58,12 @@ pub trait Camera: Send {
     /// The first frame that was not delivered yet, waiting for it at most `timeout`. A camera that
     /// is read too slowly drops frames, seen as gaps in [`Frame::sequence`].
     fn next_frame(&mut self, timeout: Duration) -> Result<Frame, DeviceError>;
+}
+
+impl<C: Camera + ?Sized> Camera for Box<C> {
+    fn next_frame(&mut self, timeout: Duration) -> Result<Frame, DeviceError> {
+        (**self).next_frame(timeout)
+    }
 }
 
 /// Angles of one head at one time, as the encoders tell them.
@@ -181,4 +189,6 @@ pub struct Robot {
     pub heads: [Head; 2],
     /// The tag radio.
     pub radio: Box<dyn TagLink>,
+    /// The arm, on robots that have one.
+    pub arm: Option<Box<dyn Arm>>,
 }

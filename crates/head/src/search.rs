@@ -126,6 +126,8 @@ impl Search {
     /// Angles of both heads for the next dwell; `None` when everything has been looked at, or both
     /// heads have sighted the light. A head with nothing to look at stays where it is.
     pub fn next(&mut self, current: [[f64; 2]; 2]) -> Option<[[f64; 2]; 2]> {
+        // At its limit a joint's encoder, which counts in steps, may tell an angle beyond it.
+        let current = [0, 1].map(|k| self.heads[k].clamp(current[k]));
         if !self.started {
             self.started = true;
             let mut useful = false;

@@ -54,19 +54,31 @@ impl Ears {
         let mut bytes = address.into_inner();
         bytes.reverse();
         let tag = TagAddress(bytes);
-        let mut all = self.heard.borrow_mut();
-        let heard = all.entry(tag).or_default();
-        heard.beacon.hear(data);
-        // 127: the controller cannot tell.
-        if rssi <= 20 {
-            heard.rssi += i32::from(rssi);
-            heard.count += 1;
-        }
+        self.hear_strength(tag, rssi);
         if kind.as_raw() & 1 == 0 {
             self.public.borrow_mut().insert(tag);
         } else {
             self.public.borrow_mut().remove(&tag);
         }
+        self.hear_data(tag, data);
+    }
+
+    /// A packet came this strong (dBm).
+    pub fn hear_strength(&self, tag: TagAddress, rssi: i8) {
+        let mut all = self.heard.borrow_mut();
+        let heard = all.entry(tag).or_default();
+        // 127: the controller cannot tell.
+        if rssi <= 20 {
+            heard.rssi += i32::from(rssi);
+            heard.count += 1;
+        }
+    }
+
+    /// A packet, or a part of one, said this.
+    pub fn hear_data(&self, tag: TagAddress, data: &[u8]) {
+        let mut all = self.heard.borrow_mut();
+        let heard = all.entry(tag).or_default();
+        heard.beacon.hear(data);
         if let Some(name) = heard.beacon.object_id() {
             let claim = Claim { name: name.into(), short_id: heard.beacon.short_id };
             self.claims.borrow_mut().insert(tag, claim);
@@ -95,6 +107,11 @@ impl Ears {
     /// The tag was heard with a public address; all others are taken for random ones.
     pub fn is_public(&self, tag: TagAddress) -> bool {
         self.public.borrow().contains(&tag)
+    }
+
+    /// The tag holds another record now: what it claimed to be no longer counts.
+    pub fn rewritten(&self, tag: TagAddress) {
+        self.claims.borrow_mut().remove(&tag);
     }
 
     /// What the tag claims to be.

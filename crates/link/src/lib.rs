@@ -9,21 +9,28 @@
 //! two tags that claim one object are both seen. A record whose object id is not the advertised one
 //! is refused. Links are ended after use, but held while a tag's light plays.
 
+#[cfg(feature = "bluez")]
+mod bluez;
 mod central;
+mod conversation;
 mod ears;
 mod flash;
 mod hci;
 mod job;
 mod pool;
+mod radio;
 mod server;
 mod simulation;
 mod virtual_tag;
 
+#[cfg(feature = "bluez")]
+pub use bluez::BluezLink;
 pub use central::LinkConfig;
 pub use flash::{BLOCK, MemoryFlash, OutOfBounds};
 pub use hci::HciLink;
 pub use job::{BOND_BYTES, Bond, TagInfo};
 pub use pool::{HeapPacket, HeapPool};
+pub use radio::TagRadio;
 pub use server::TagServer;
 pub use simulation::{RadioConfig, VirtualRadio};
 pub use virtual_tag::{LightPlay, Plays, VirtualTag};

@@ -7,6 +7,7 @@
 //!
 //! Equal configuration, seed and sequence of calls give equal bytes. What is simulated and how is
 //! said in the private modules: `trace` (light), `camera` (sensor), `servo`, `radio`, `lights`.
+//! [`WiredWorkcell`] offers the same devices over the wires of real ones, in real time.
 //! [`stereo_scene`] gives single stereo pairs with their truth, for measuring pose recognition.
 
 mod camera;
@@ -21,6 +22,7 @@ mod scene;
 mod servo;
 mod stereo_scene;
 mod trace;
+mod wired;
 mod workcell;
 mod world;
 
@@ -31,7 +33,8 @@ pub use config::{
 pub use error::SimError;
 pub use stereo_scene::{StereoScene, stereo_scene};
 pub use vergence_link::HciLink;
-pub use workcell::{TrueCamera, TrueObject, Truth, Workcell, embedded_files, settings};
+pub use wired::{WiredWorkcell, fitting_servo};
+pub use workcell::{ArmPart, TrueCamera, TrueObject, Truth, Workcell, embedded_files, settings};
 
 /// The embedded robot's description.
 pub const EMBEDDED_URDF: &str = include_str!("../assets/workcell.urdf");

@@ -9,13 +9,16 @@
 //! A tag's own clock is off by some parts per million: that shows in the chips of its light, which
 //! drift from the robot's clock, and is left out where it would come to a millisecond once.
 
+use std::io;
+use std::net::TcpListener;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use rand::RngExt;
+use rand_pcg::Pcg64Mcg;
 use vergence_devices::{Clock, TagAddress};
 use vergence_firmware::{Access, Config};
-use vergence_link::{HciLink, LinkConfig, RadioConfig, VirtualRadio, VirtualTag};
+use vergence_link::{HciLink, LinkConfig, Plays, RadioConfig, TagServer, VirtualRadio, VirtualTag};
 use vergence_tag::cbor::{self, MAX_BYTES};
 
 use crate::camera::Blinker;
@@ -36,9 +39,11 @@ const FADING: f64 = 2.0;
 const AWAKE: f64 = 60.0;
 
 /// All tags on their air.
-#[derive(Debug)]
 pub struct Radio {
     radio: VirtualRadio,
+    /// The tags on real time, for whoever connects; the ones above then play no part.
+    served: Option<TagServer>,
+    tags: Vec<VirtualTag>,
     /// Of every tag: seconds of its clock per second of the robot's.
     rates: Vec<f64>,
     /// The radio's time when the robot's clock was zero.
@@ -68,8 +73,6 @@ impl Radio {
             });
         }
         let radio = settings.radio;
-        let distances: Vec<f64> =
-            objects.iter().map(|o| o.base_from_object.translation.vector.norm()).collect();
         let mut rng = stream(seed, "radio", 0);
         let mut config = RadioConfig {
             link: LinkConfig {
@@ -82,40 +85,53 @@ impl Radio {
         // The robot comes at any time between two advertisements.
         let idle = AWAKE + radio.advertising_interval * rng.random::<f64>();
         let epoch = Duration::from_micros((1e6 * idle) as u64);
-        let chance = Mutex::new(rng);
-        let hearing = move |tag: usize| {
-            let distance = *distances.get(tag)?;
-            let mut chance = chance.lock().unwrap_or_else(PoisonError::into_inner);
-            let lost = chance.random::<f64>() < radio.loss;
-            let fading = FADING * normal(&mut chance);
-            if lost || distance > radio.range {
-                return None;
-            }
-            let rssi = RSSI_AT_1M - RSSI_PER_DECADE * distance.max(0.1).log10() + fading;
-            Some(rssi.round().clamp(-110.0, 0.0) as i8)
-        };
-        let radio =
-            VirtualRadio::new(config, tags, Duration::ZERO, hearing).map_err(SimError::Radio)?;
-        Ok(Radio { radio, rates, epoch })
+        let hearing = hearing(settings, objects, rng);
+        let radio = VirtualRadio::new(config, tags.clone(), Duration::ZERO, hearing)
+            .map_err(SimError::Radio)?;
+        Ok(Radio { radio, served: None, tags, rates, epoch })
+    }
+
+    /// Takes the tags to real time and to a TCP listener, where everybody who connects gets a
+    /// Bluetooth controller. `now` is the world's time.
+    pub fn serve(
+        &mut self,
+        settings: &SimConfig,
+        objects: &[TaggedObject],
+        seed: u64,
+        listener: TcpListener,
+        now: Duration,
+    ) -> io::Result<()> {
+        let mut rng = stream(seed, "radio", 1);
+        let air = vergence_air::AirConfig { seed: rng.random(), ..Default::default() };
+        let hearing = hearing(settings, objects, rng);
+        let server = TagServer::start(listener, air, self.tags.clone(), now, hearing)?;
+        self.served = Some(server);
+        self.epoch = Duration::ZERO;
+        Ok(())
     }
 
     /// Lets everything happen up to a time of the robot's clock.
     pub fn advance_to(&self, time: Duration) {
-        self.radio.advance_to(time.saturating_add(self.epoch));
+        if self.served.is_none() {
+            self.radio.advance_to(time.saturating_add(self.epoch));
+        }
+    }
+
+    fn log(&self) -> &Plays {
+        self.served.as_ref().map_or_else(|| self.radio.plays(), TagServer::plays)
     }
 
     /// Forgets what ended before a time (s), which no frame can show any more.
     pub fn forget_plays_before(&self, time: f64) {
         let time = Duration::try_from_secs_f64(time).unwrap_or_default();
-        self.radio.plays().forget_before(time + self.epoch);
+        self.log().forget_before(time + self.epoch);
     }
 
     /// What the LEDs of a tag play or played lately, but for what begins after a time (s).
     pub fn plays(&self, tag: usize, until: f64) -> Vec<Play> {
         let rate = self.rates.get(tag).copied().unwrap_or(1.0);
         let epoch = self.epoch.as_secs_f64();
-        self.radio
-            .plays()
+        self.log()
             .of(tag)
             .iter()
             .map(|play| Play {
@@ -126,6 +142,29 @@ impl Radio {
             })
             .filter(|play| play.begin <= until)
             .collect()
+    }
+}
+
+/// Who hears which tag how strongly, a transmission at a time.
+fn hearing(
+    settings: &SimConfig,
+    objects: &[TaggedObject],
+    rng: Pcg64Mcg,
+) -> impl Fn(usize) -> Option<i8> + Send + 'static {
+    let radio = settings.radio;
+    let distances: Vec<f64> =
+        objects.iter().map(|o| o.base_from_object.translation.vector.norm()).collect();
+    let chance = Mutex::new(rng);
+    move |tag: usize| {
+        let distance = *distances.get(tag)?;
+        let mut chance = chance.lock().unwrap_or_else(PoisonError::into_inner);
+        let lost = chance.random::<f64>() < radio.loss;
+        let fading = FADING * normal(&mut chance);
+        if lost || distance > radio.range {
+            return None;
+        }
+        let rssi = RSSI_AT_1M - RSSI_PER_DECADE * distance.max(0.1).log10() + fading;
+        Some(rssi.round().clamp(-110.0, 0.0) as i8)
     }
 }
 

@@ -4,12 +4,18 @@
 //! A thread reads the stream as fast as it comes, so that pictures never queue up in the network, and
 //! keeps the newest few; the rest are seen as gaps in [`Frame::sequence`]. It reconnects when the
 //! stream ends, breaks or falls silent. Pictures are stamped with the `X-Timestamp` header of their
-//! part when there is one: the camera's clock is brought to ours by the smallest delay seen lately.
-//! Else the arrival of the part's header is the stamp, late by the transport.
+//! part when there is one: the camera's clock is brought to ours by the smallest delay seen lately, and
+//! pictures that the camera or the network lost are counted by it. Else the arrival of the part's
+//! header is the stamp, late by the transport. Stamps always grow, also when the camera's clock is set.
+//! A picture that is the one before, byte for byte, comes from a camera that froze, and is not taken.
 //!
 //! Exposure is not told by such cameras; the configuration may.
+//!
+//! [`MjpegServer`] is the other side: it offers pictures as such cameras do.
 
 mod multipart;
+mod server;
+mod timing;
 
 use std::collections::VecDeque;
 use std::io::{BufReader, Write};
@@ -23,16 +29,18 @@ use vergence_imaging::{Frame, codec};
 
 use crate::traits::{Camera, Clock, DeviceError};
 use multipart::{Part, StreamError};
+pub use server::MjpegServer;
+use timing::Timing;
 
 /// A stream that says nothing for so long is dead.
 const SILENCE: Duration = Duration::from_secs(2);
 const CONNECT: Duration = Duration::from_secs(2);
 /// Wait between attempts to connect.
 const RETRY: Duration = Duration::from_millis(200);
-/// Pictures kept for a reader that is busy for a moment.
-const KEPT: usize = 4;
-/// Pictures over which the smallest delay is sought: ten seconds at 30 a second.
-const DELAY_WINDOW: usize = 300;
+/// Pictures kept for a reader that is busy for a moment: half a second at 30 a second.
+const KEPT: usize = 16;
+/// Equal pictures after which the camera counts as frozen: a sensor's noise never repeats.
+const FROZEN: usize = 5;
 
 /// Settings of one such camera.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
@@ -98,8 +106,14 @@ impl MjpegCamera {
             device: config.url.clone(),
             reason: e.to_string(),
         })?;
-        let reader =
-            Reader { target, shared: shared.clone(), clock, sequence: 0, delays: VecDeque::new() };
+        let reader = Reader {
+            target,
+            shared: shared.clone(),
+            clock,
+            timing: Timing::default(),
+            last: Vec::new(),
+            repeats: 0,
+        };
         let thread = std::thread::spawn(move || reader.run(first));
         Ok(MjpegCamera {
             url: config.url.clone(),
@@ -219,9 +233,10 @@ struct Reader {
     target: Target,
     shared: Arc<Shared>,
     clock: Arc<dyn Clock>,
-    sequence: u64,
-    /// Arrival minus the camera's stamp (s) of the last pictures.
-    delays: VecDeque<f64>,
+    timing: Timing,
+    /// The picture before, and how often it came again.
+    last: Vec<u8>,
+    repeats: usize,
 }
 
 impl Reader {
@@ -251,7 +266,7 @@ impl Reader {
     /// Reads pictures until the stream fails; gives the reason.
     fn read(&mut self, stream: TcpStream) -> StreamError {
         // Another connection may be another run of the camera, with another clock.
-        self.delays.clear();
+        self.timing.forget_clock();
         let mut parts = match multipart::Parts::open(BufReader::new(stream)) {
             Ok(parts) => parts,
             Err(e) => return e,
@@ -269,9 +284,18 @@ impl Reader {
     }
 
     fn deliver(&mut self, part: Part<Duration>) {
-        let stamp = self.stamp(part.arrival, part.timestamp);
-        let picture = Picture { jpeg: part.body, stamp, sequence: self.sequence };
-        self.sequence += 1;
+        if part.body == self.last {
+            self.repeats += 1;
+            if self.repeats >= FROZEN {
+                let trouble = format!("the same picture came {} times: it froze", self.repeats + 1);
+                self.shared.lock().trouble = Some(trouble);
+            }
+            return;
+        }
+        self.repeats = 0;
+        let (stamp, sequence) = self.timing.place(part.arrival, part.timestamp);
+        self.last.clone_from(&part.body);
+        let picture = Picture { jpeg: part.body, stamp, sequence };
         let mut state = self.shared.lock();
         state.trouble = None;
         state.pictures.push_back(picture);
@@ -279,22 +303,6 @@ impl Reader {
             state.pictures.pop_front();
         }
         self.shared.news.notify_all();
-    }
-
-    /// The capture time on our clock.
-    fn stamp(&mut self, arrival: Duration, camera: Option<f64>) -> Duration {
-        let Some(camera) = camera else { return arrival };
-        let delay = arrival.as_secs_f64() - camera;
-        // A clock that jumps has nothing to do with the delays before.
-        if self.delays.back().is_some_and(|last| (delay - last).abs() > 1.0) {
-            self.delays.clear();
-        }
-        self.delays.push_back(delay);
-        if self.delays.len() > DELAY_WINDOW {
-            self.delays.pop_front();
-        }
-        let least = self.delays.iter().copied().fold(f64::INFINITY, f64::min);
-        Duration::try_from_secs_f64(camera + least).unwrap_or(arrival)
     }
 }
 

@@ -121,3 +121,47 @@ fn silence_wrong_sizes_and_wrong_addresses_are_told() {
     assert!(matches!(open("ftp://x"), Err(DeviceError::Unsupported { .. })));
     assert!(matches!(open("http://127.0.0.1:1/x"), Err(DeviceError::Disconnected { .. })));
 }
+
+#[test]
+fn a_camera_that_freezes_or_loses_pictures_is_told() {
+    let url = server(vec![Box::new(|stream| {
+        stream.write_all(HEAD.as_bytes()).unwrap();
+        for i in [0, 1, 2, 3, 4, 5, 9] {
+            stream.write_all(&part(10 * i, 0.02 * f64::from(i))).unwrap();
+            std::thread::sleep(Duration::from_millis(30));
+        }
+        // From here on the pictures stay what they are; only their times go on.
+        for i in 10..40 {
+            stream.write_all(&part(90, 0.02 * f64::from(i))).unwrap();
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    })]);
+    let mut camera = open(&url).unwrap();
+    let numbers: Vec<u64> = (0..7).map(|_| camera.next_frame(SOON).unwrap().sequence).collect();
+    assert_eq!(numbers, [0, 1, 2, 3, 4, 5, 9]);
+    let error = camera.next_frame(Duration::from_millis(300)).unwrap_err();
+    assert!(matches!(&error, DeviceError::Disconnected { reason, .. } if reason.contains("froze")));
+}
+
+#[test]
+fn our_own_server_is_a_camera_too() {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let server = MjpegServer::start(listener, &["/left", "/right"]).unwrap();
+    let at = |path: &str| format!("http://{}{path}", server.address());
+    let mut camera = open(&at("/right?any")).unwrap();
+    assert!(!server.watched(0));
+    for i in 0..5u8 {
+        while !server.watched(1) {
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        server.show(1, jpeg(40 * i), Duration::from_millis(100 * u64::from(i)));
+        let frame = camera.next_frame(SOON).unwrap();
+        assert!(frame.image.data()[0].abs_diff(40 * i) < 4);
+    }
+    let mut nowhere = open(&at("/up")).unwrap();
+    let error = nowhere.next_frame(Duration::from_millis(500)).unwrap_err().to_string();
+    assert!(error.contains("404"), "{error}");
+    drop(server);
+    let error = camera.next_frame(Duration::from_millis(500)).unwrap_err();
+    assert!(matches!(error, DeviceError::Disconnected { .. }), "{error}");
+}

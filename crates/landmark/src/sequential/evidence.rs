@@ -13,11 +13,17 @@ use vergence_tag::Pattern;
 use super::nuisance::{Nuisance, dot};
 use super::template::{Bank, Hypothesis, light};
 
-/// Weight of the neighbourhood's noise against the pixel's own, in frames.
-const NOISE_FRAMES: f64 = 200.0;
+/// Weight of the neighbourhood's noise against the place's own, in frames: a block holds about 23
+/// independent places, so after 40 frames it knows its noise this well.
+const NOISE_FRAMES: f64 = 1000.0;
 
-/// Widths of the amplitude priors, in noise standard deviations.
-const WIDTHS: [f64; 3] = [2.0, 8.0, 32.0];
+/// Widths of the amplitude priors, in noise standard deviations, and their weights. A strong light is
+/// decided within frames whatever its prior; most of the weight goes where it saves frames.
+const WIDTHS: [(f64, f64); 3] = [(2.0, 0.8), (8.0, 0.15), (32.0, 0.05)];
+
+/// Standard deviations by which a place must be noisier than its neighbourhood to have noise of its
+/// own: less is chance, and taking the larger of the two every time would only cost frames.
+const OWN_NOISE: f64 = 1.5;
 
 /// A deviation this many times the ninth decile of all deviations is cut to it: something passed.
 const CLIP: f32 = 3.0;
@@ -76,10 +82,12 @@ impl Series {
     }
 
     /// Energy with the prior's share added. A place that stays noisier than its neighbourhood once
-    /// the best light is taken out has noise of its own.
+    /// the best light is taken out, by more than chance explains, has noise of its own.
     fn total(&self, explained: f64) -> f64 {
         let own = (self.energy - explained).max(0.0) / self.freedom;
-        self.energy + NOISE_FRAMES * self.noise.max(own)
+        let chance = 1.0 + OWN_NOISE * (2.0 / self.freedom).sqrt();
+        let own = if own > chance * self.noise { own } else { self.noise };
+        self.energy + NOISE_FRAMES * own
     }
 }
 
@@ -102,8 +110,11 @@ fn clip(values: &mut [f32]) -> bool {
 /// What a series says about one pattern.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Evidence {
-    /// Natural logarithm of the likelihood ratio against "no light".
+    /// Natural logarithm of the likelihood ratio against "no light, and the noise of the surroundings".
     pub log_ratio: f64,
+    /// The same against "no light, but a restless place with a noise of its own", of which nothing is
+    /// known: an edge that sways, a screen.
+    pub restless: f64,
     /// The best phase and rate.
     pub best: Hypothesis,
     /// Scalar product of series and expected light of unit length there (grey levels).
@@ -136,18 +147,24 @@ pub fn weigh(series: &Series, bank: &Bank, floor: f64, scratch: &mut Vec<f32>) -
     };
     let correlation = f64::from(scratch[best]);
     let total = series.total(correlation * correlation);
-    let weigh = |c: f64, norm2: f64| log_ratio(series.freedom, total, c, norm2);
+    let weigh = |c: f64, norm2: f64| log_ratio(series.freedom, NOISE_FRAMES, total, c, norm2);
+    let restless = |c: f64, norm2: f64| log_ratio(series.freedom, 0.0, series.energy, c, norm2);
     let bound = weigh(correlation, scaled(best).norm2);
-    let evidence = Evidence { log_ratio: bound, best: scaled(best), correlation };
+    let restless_bound = restless(correlation, scaled(best).norm2);
+    let evidence =
+        Evidence { log_ratio: bound, restless: restless_bound, best: scaled(best), correlation };
     if bound < floor {
         return Some(evidence);
     }
-    let mut sum = 0.0;
+    let (mut sum, mut restless_sum) = (0.0, 0.0);
     for (k, c) in scratch.iter().enumerate().filter(|(_, c)| **c > 0.0) {
-        sum += (weigh(f64::from(*c), scaled(k).norm2) - bound).exp();
+        let (c, norm2) = (f64::from(*c), scaled(k).norm2);
+        sum += (weigh(c, norm2) - bound).exp();
+        restless_sum += (restless(c, norm2) - restless_bound).exp();
     }
-    let log_ratio = bound + (sum / bank.hypotheses.len() as f64).ln();
-    Some(Evidence { log_ratio, ..evidence })
+    let count = bank.hypotheses.len() as f64;
+    let log_ratio = bound + (sum / count).ln();
+    Some(Evidence { log_ratio, restless: restless_bound + (restless_sum / count).ln(), ..evidence })
 }
 
 /// Share of each hypothesis' light (squared length) that the surroundings leave; empty: all.
@@ -165,22 +182,40 @@ fn kept(series: &Series, bank: &Bank) -> Vec<f32> {
     kept.iter().map(|k| if *k < 0.1 { f32::INFINITY } else { *k }).collect()
 }
 
-/// Log likelihood ratio of one phase and rate, amplitude and noise averaged over.
-fn log_ratio(freedom: f64, total: f64, correlation: f64, norm2: f64) -> f64 {
+/// Log likelihood ratio of one phase and rate, amplitude and noise averaged over; the noise under a
+/// prior that weighs as much as `prior` frames.
+fn log_ratio(freedom: f64, prior: f64, total: f64, correlation: f64, norm2: f64) -> f64 {
     if correlation <= 0.0 {
         return 0.0;
     }
     let explained = (correlation * correlation / total).min(0.999_999);
-    let half = 0.5 * (freedom + NOISE_FRAMES);
-    let term = |width: &f64| {
+    let half = 0.5 * (freedom + prior);
+    let term = |(width, weight): (f64, f64)| {
         let gain = width * width * norm2;
-        -0.5 * (1.0 + gain).ln() - half * (-explained * gain / (1.0 + gain)).ln_1p()
+        weight.ln() - 0.5 * (1.0 + gain).ln() - half * (-explained * gain / (1.0 + gain)).ln_1p()
     };
-    let terms = WIDTHS.map(|w| term(&w));
+    let terms = WIDTHS.map(term);
     let largest = terms.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    let mean = terms.iter().map(|t| (t - largest).exp()).sum::<f64>() / WIDTHS.len() as f64;
+    let mean = terms.iter().map(|t| (t - largest).exp()).sum::<f64>();
     // Half-normal: the amplitude is positive, so the prior is twice as dense there.
     largest + mean.ln() + std::f64::consts::LN_2
+}
+
+/// By how much the log likelihood ratio of the best phase grows when phases between those of the bank
+/// are tried.
+pub fn refined_gain(
+    series: &Series,
+    pattern: &Pattern,
+    times: &[(f64, f64)],
+    nuisance: &Nuisance,
+    start: Evidence,
+    step: f64,
+) -> f64 {
+    let at = |e: &Evidence| {
+        let total = series.total(e.correlation * e.correlation);
+        log_ratio(series.freedom, NOISE_FRAMES, total, e.correlation, e.best.norm2)
+    };
+    at(&refine(series, pattern, times, nuisance, start, step)) - at(&start)
 }
 
 /// The best phase between those of the bank: golden-section search around the best one.

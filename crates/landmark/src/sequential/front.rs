@@ -22,10 +22,27 @@ pub const NOISE_GAIN: f32 = 10.4;
 /// Variance (px^2) of the blob that a point light makes in the filtered image.
 pub const BLOB_VARIANCE: f64 = 2.0 * 0.68 * 0.68;
 
-/// Applies the filter; the border repeats the outermost pixel.
-pub fn filter(image: &Image<u8>) -> Image<i16> {
+/// Covariance of the filter output between two pixels that lie `dx` and `dy` (px, up to 3) apart,
+/// relative to its variance, when the noise of the pixels is white.
+pub fn noise_correlation(dx: usize, dy: usize) -> f32 {
+    // Peak with peak, peak with box, box with box: all are products of one dimension each.
+    const PEAK: [f32; 4] = [11.0, 6.0, 1.0, 0.0];
+    const CROSS: [f32; 4] = [5.0, 5.0, 5.0, 4.0];
+    const BOX: [f32; 4] = [7.0, 6.0, 5.0, 4.0];
+    let level = 25.0 / 49.0;
+    let at = |x: usize, y: usize| {
+        let product = |of: &[f32; 4]| of[x.min(3)] * of[y.min(3)];
+        product(&PEAK) - 2.0 * level * product(&CROSS) + level * level * product(&BOX)
+    };
+    at(dx, dy) / at(0, 0)
+}
+
+/// Applies the filter; the border repeats the outermost pixel. `reuse`: a picture whose memory may be
+/// taken when it has the right size.
+pub fn filter(image: &Image<u8>, reuse: Option<Image<i16>>) -> Image<i16> {
     let (width, height) = (image.width(), image.height());
-    let mut out = Image::filled(width, height, 0i16);
+    let fits = |old: &Image<i16>| (old.width(), old.height()) == (width, height);
+    let mut out = reuse.filter(fits).unwrap_or_else(|| Image::filled(width, height, 0i16));
     let row = |y: i64| image.row(y.clamp(0, height as i64 - 1) as usize);
     let padded = width + 2 * REACH;
     let (mut three, mut seven) = (vec![0u16; padded], vec![0u16; padded]);
@@ -148,7 +165,7 @@ mod tests {
         };
         let image =
             Image::from_fn(40, 30, |x, y| (50.0 + 2.0 * x as f64 + y as f64 + light(x, y)) as u8);
-        let filtered = filter(&image);
+        let filtered = filter(&image, None);
         let peak = f32::from(filtered.row(15)[20]) / GAIN;
         assert!((peak - 40.0).abs() < 1.0, "{peak}");
         let flat = f32::from(filtered.row(8)[9]) / GAIN;
@@ -160,7 +177,7 @@ mod tests {
         let image = Image::from_fn(33, 21, |x, y| (x * 37 + y * 91 + x * y) as u8);
         let at =
             |x: i64, y: i64| i64::from(image.row(y.clamp(0, 20) as usize)[x.clamp(0, 32) as usize]);
-        let filtered = filter(&image);
+        let filtered = filter(&image, None);
         for y in 0..21i64 {
             for x in 0..33i64 {
                 let taps = [1, 3, 1];

@@ -18,10 +18,12 @@
 //! Memory is a window of frames of constant length. The mathematics is that of `docs/landmark.md`.
 
 pub mod evidence;
+pub mod explain;
 pub mod front;
 pub mod history;
 pub mod motion;
 pub mod nuisance;
+pub mod places;
 pub mod scan;
 pub mod shift;
 pub mod surroundings;
@@ -30,6 +32,7 @@ mod verdict;
 
 use std::time::Duration;
 
+use nalgebra::Point2;
 use vergence_imaging::{Frame, Image};
 use vergence_tag::Pattern;
 
@@ -38,9 +41,10 @@ use crate::{Decision, Finder, FinderError, Request};
 use front::Variation;
 use history::{History, Past};
 use motion::{Placement, Reference};
-use nuisance::{Nuisance, STILL_PX};
-use scan::{BlockNoise, Candidate};
-use verdict::Round;
+use nuisance::{Lamps, Nuisance, STILL_PX};
+use places::Places;
+use scan::{BlockNoise, Candidate, Family, Strong};
+use verdict::{Banks, Round};
 
 /// Settings of the sequential finder.
 #[derive(Debug, Clone, PartialEq)]
@@ -76,20 +80,33 @@ const FIRST_FRAMES: usize = 6;
 /// First frame count at which the picture is scanned for weak lights.
 const FIRST_SCAN: usize = 16;
 
+/// How often (frames) places that vary strongly are added to the short list after the first frames.
+const STRONG_EVERY: usize = 4;
+
+/// Share of the presence threshold from which a place stays on the short list whatever a scan says.
+const KEEP: f64 = 0.4;
+
 /// The sequential method as a [`Finder`].
 #[derive(Debug, Clone)]
 pub struct SequentialFinder {
     requests: Vec<Request>,
     config: Config,
+    /// Requests whose patterns share length and chip.
+    families: Vec<Vec<usize>>,
     sequence: Sequence,
     reference: Reference,
     variation: Option<Variation>,
     history: History,
+    /// Memory of the picture that left the window last.
+    spare: Option<Image<i16>>,
     noise: BlockNoise,
-    weak: Vec<Candidate>,
+    lamps: Lamps,
+    places: Places,
+    /// Places that varied more than the noise explains when last looked.
+    restless: Vec<Point2<f64>>,
+    banks: Banks,
     decisions: Vec<Decision>,
     frames: usize,
-    next_round: usize,
     next_scan: usize,
     size: (usize, usize),
 }
@@ -100,15 +117,19 @@ impl SequentialFinder {
         check_requests(&requests)?;
         Ok(SequentialFinder {
             decisions: vec![Decision::Undecided; requests.len()],
+            families: families(&requests),
+            banks: Banks::new(requests.len()),
             requests,
             sequence: Sequence::default(),
             reference: Reference::default(),
             variation: None,
             history: History::new(config.window_frames.max(FIRST_SCAN)),
+            spare: None,
             noise: BlockNoise::default(),
-            weak: Vec::new(),
+            lamps: Lamps::default(),
+            places: Places::default(),
+            restless: Vec::new(),
             frames: 0,
-            next_round: FIRST_FRAMES,
             next_scan: FIRST_SCAN,
             size: (0, 0),
             config,
@@ -120,43 +141,97 @@ impl SequentialFinder {
         self.frames
     }
 
-    /// Weighs the evidence of the window, after a scan of the whole picture where that is due.
-    fn round(&mut self, scan: bool, stamp: Duration) {
+    /// Looks at the places that are due, after a scan of the whole picture where that is wanted.
+    fn round(&mut self, scan: bool, last: bool, stamp: Duration) {
         let Some(variation) = &self.variation else { return };
         let ((width, height), n) = (self.size, self.history.len());
         let energy = variation.energy();
-        if scan || self.noise.is_empty() || self.frames <= FIRST_SCAN {
+        if scan || self.frames <= FIRST_SCAN {
             self.noise = BlockNoise::new(energy, width, height, n);
         }
-        let nuisance = Nuisance::of(&self.history);
         if scan {
-            let patterns: Vec<Option<&Pattern>> =
-                self.requests.iter().map(|r| Some(&r.pattern)).collect();
-            self.weak = scan::by_lines(
-                &self.history,
-                energy,
-                width,
-                height,
-                &self.noise,
-                &nuisance,
-                &patterns,
-            );
+            self.lamps = Lamps::of(&self.history);
+            let candidates = self.scan(energy);
+            self.places.renew(candidates, KEEP * self.presence());
         }
-        let mut candidates = scan::by_energy(energy, width, height, n, &self.noise);
-        candidates.extend(&self.weak);
+        if scan || self.frames <= FIRST_SCAN || self.frames.is_multiple_of(STRONG_EVERY) {
+            let strong = scan::by_energy(energy, width, height, n, &self.noise);
+            let point = |s: &Strong| Point2::new(s.pixel.0 as f64, s.pixel.1 as f64);
+            self.restless = strong.iter().filter(|s| s.restless).map(point).collect();
+            for Strong { pixel, .. } in strong.into_iter().take(scan::BY_ENERGY) {
+                self.places.add(pixel, 0..self.requests.len());
+            }
+        }
+        if !scan && !self.places.any_due(self.frames) {
+            return;
+        }
+        let nuisance = Nuisance::of(&self.history, &self.lamps);
+        let known =
+            self.decisions.iter().filter_map(Decision::brightest).map(|s| s.pixel).collect();
         let round = Round {
             requests: &self.requests,
             config: &self.config,
             history: &self.history,
             noise: &self.noise,
             nuisance: &nuisance,
-            times: self.history.times(),
             frames: self.frames,
             stamp,
             size: self.size,
+            restless: &self.restless,
+            known,
         };
-        round.decide(&candidates, &mut self.decisions);
+        let places = self.places.as_mut_slice();
+        round.decide(places, &mut self.banks, last, &mut self.decisions);
+        if scan {
+            round.rule_out(&mut self.decisions);
+        }
     }
+
+    /// Log likelihood ratio that presence needs.
+    fn presence(&self) -> f64 {
+        verdict::presence(self.size, self.requests.len(), self.config.false_alarm)
+    }
+
+    /// The places whose light may be that of a pattern.
+    fn scan(&self, energy: &[f32]) -> Vec<Candidate> {
+        let nuisance = Nuisance::of(&self.history, &self.lamps);
+        let times = self.history.times();
+        let family = |requests: &Vec<usize>| {
+            let pattern = |r: &usize| &self.requests[*r].pattern;
+            let patterns: Vec<&Pattern> = requests.iter().map(pattern).collect();
+            Family {
+                requests: requests.clone(),
+                lines: template::lines(&patterns, times, &nuisance),
+            }
+        };
+        let families: Vec<Family> = self.families.iter().map(family).collect();
+        let (history, noise, presence) = (&self.history, &self.noise, self.presence());
+        scan::by_lines(history, energy, self.size, noise, &nuisance, &families, presence)
+    }
+}
+
+/// Requests grouped by length and chip of their patterns.
+fn families(requests: &[Request]) -> Vec<Vec<usize>> {
+    let mut families: Vec<Vec<usize>> = Vec::new();
+    for (k, request) in requests.iter().enumerate() {
+        let kin = |r: usize| {
+            let other = &requests[r].pattern;
+            other.chip == request.pattern.chip && other.bits.len() == request.pattern.bits.len()
+        };
+        match families.iter_mut().find(|f| kin(f[0])) {
+            Some(family) => family.push(k),
+            None => families.push(vec![k]),
+        }
+    }
+    families
+}
+
+/// Registers and filters a frame.
+fn past(reference: &mut Reference, frame: &Frame, time: f64, reuse: Option<Image<i16>>) -> Past {
+    let mut placement = reference.place(&frame.image);
+    placement.row_gain = nuisance::smoothed(&placement.row_gain);
+    let filtered = still(front::filter(&frame.image, reuse), &placement);
+    Past { time, exposure: frame.exposure.as_secs_f64(), placement, filtered }
 }
 
 /// The filtered frame, moved back to where the first frame lay.
@@ -164,28 +239,27 @@ fn still(filtered: Image<i16>, placement: &Placement) -> Image<i16> {
     if placement.dx.hypot(placement.dy) < STILL_PX {
         return filtered;
     }
-    shift::shifted(&filtered, placement.dx, placement.dy).map(|v| v.round() as i16)
+    shift::shifted(&filtered, placement.dx, placement.dy).map(shift::rounded)
 }
 
 impl Finder for SequentialFinder {
     fn push(&mut self, frame: &Frame) -> Result<(), FinderError> {
         let time = self.sequence.accept(frame)?;
         self.size = (frame.image.width(), frame.image.height());
-        let placement = self.reference.place(&frame.image);
-        let filtered = still(front::filter(&frame.image), &placement);
+        let past = past(&mut self.reference, frame, time, self.spare.take());
         let pixels = self.size.0 * self.size.1;
         let window = self.config.window_frames;
         let variation = self.variation.get_or_insert_with(|| Variation::new(pixels, window));
-        variation.push(filtered.data());
-        let exposure = frame.exposure.as_secs_f64();
-        self.history.push(Past { time, exposure, placement, filtered });
+        variation.push(past.filtered.data());
+        self.spare = self.history.push(past);
         self.frames += 1;
-        if self.frames >= self.next_round {
+        if self.frames >= FIRST_FRAMES {
             let scan = self.frames >= self.next_scan;
-            self.round(scan, frame.stamp);
-            self.next_round = self.frames + (self.frames / 16).max(1);
+            self.round(scan, false, frame.stamp);
             if scan {
-                self.next_scan = self.frames + (self.frames.min(window) / 5).max(8);
+                // A full window gains no more evidence, it only forgets: half as often.
+                let every = if self.frames < window { self.frames / 4 } else { window / 2 };
+                self.next_scan = self.frames + every.max(8);
             }
         }
         Ok(())
@@ -194,7 +268,7 @@ impl Finder for SequentialFinder {
     fn finish(&mut self) {
         let last = self.sequence.last_stamp();
         if let (Some(stamp), true) = (last, self.frames >= FIRST_FRAMES) {
-            self.round(true, stamp);
+            self.round(true, true, stamp);
         }
     }
 

@@ -5,6 +5,8 @@
 //! brightness of a row is the median over its pixels; in the fit, pixels that differ far from what the
 //! motion explains (people, things, screens, tags) count nothing (Tukey's biweight).
 
+use std::borrow::Cow;
+
 use vergence_imaging::Image;
 
 use super::shift::shifted;
@@ -12,9 +14,18 @@ use super::shift::shifted;
 /// Independent partial sums: they vectorise, and always add up in the same order.
 const LANES: usize = 8;
 
-/// Residuals (grey levels) at which a pixel counts nothing, pass by pass: wide while the motion is
-/// unknown, then narrow.
-const CUTS: [f32; 4] = [40.0, 20.0, 10.0, 10.0];
+/// Residuals (grey levels) at which a pixel counts nothing: wide while the motion is unknown, narrow
+/// in the end.
+const CUT: (f32, f32) = (30.0, 10.0);
+
+/// Passes at most.
+const PASSES: usize = 5;
+
+/// The slopes hold this far from where they were taken (px of the half-size picture).
+const LINEAR_PX: f64 = 0.1;
+
+/// Every so manieth row takes part: there are far more pixels than two numbers need.
+const ROW_STEP: usize = 2;
 
 /// Slopes must carry this many times the energy that noise gives them.
 const STRUCTURE: f64 = 3.0;
@@ -77,11 +88,15 @@ fn fit(reference: &Image<f32>, half: &Image<f32>, guess: (f64, f64)) -> Placemen
         (0..h).map(|y| brightness(reference.row(y), half.row(y), &mut ratios)).collect();
     let (mut dx, mut dy) = (0.5 * guess.0, 0.5 * guess.1);
     let (mut error, mut structure) = ([0.0; 2], 0.0);
-    for cut in CUTS {
-        // The content moved by d: the frame shows at x what the reference shows at x - d.
-        let moved = shifted(reference, -dx, -dy);
+    let mut cut = CUT.0;
+    // Where the slopes are taken: the reference moved to the best guess so far.
+    let (mut at, mut moved) = ((dx, dy), moved_to(reference, dx, dy));
+    for _ in 0..PASSES {
+        if (dx - at.0).hypot(dy - at.1) > LINEAR_PX {
+            (at, moved) = ((dx, dy), moved_to(reference, dx, dy));
+        }
         let mut normal = [0.0f64; 7];
-        for (y, &gain) in row_gain.iter().enumerate().take(h - 1).skip(1) {
+        for (y, &gain) in row_gain.iter().enumerate().take(h - 1).skip(1).step_by(ROW_STEP) {
             let rows = [moved.row(y - 1), moved.row(y), moved.row(y + 1)];
             reduce(&accumulate(rows, half.row(y), gain, cut), &mut normal);
         }
@@ -94,8 +109,15 @@ fn fit(reference: &Image<f32>, half: &Image<f32>, guess: (f64, f64)) -> Placemen
         structure = xx.min(yy) / (noise * weight).max(1.0);
         error = [(noise / xx).sqrt(), (noise / yy).sqrt()];
         let step = ((yy * xr - xy * yr) / determinant, (xx * yr - xy * xr) / determinant);
-        dx = (dx - step.0.clamp(-1.5, 1.5)).clamp(-MOST_PX, MOST_PX);
-        dy = (dy - step.1.clamp(-1.5, 1.5)).clamp(-MOST_PX, MOST_PX);
+        dx = (at.0 - step.0.clamp(-1.5, 1.5)).clamp(-MOST_PX, MOST_PX);
+        dy = (at.1 - step.1.clamp(-1.5, 1.5)).clamp(-MOST_PX, MOST_PX);
+        let near = step.0.hypot(step.1) < LINEAR_PX;
+        if near && cut == CUT.1 {
+            break;
+        }
+        if near {
+            cut = CUT.1;
+        }
     }
     // Noise alone gives slopes of half its variance. Where the slopes are little more than that in
     // some direction, the picture has no structure that could tell of motion along it.
@@ -107,9 +129,17 @@ fn fit(reference: &Image<f32>, half: &Image<f32>, guess: (f64, f64)) -> Placemen
     Placement { dx: real(dx, error[0]), dy: real(dy, error[1]), row_gain }
 }
 
+/// The content of the reference moved by `(dx, dy)`: shows at x what the reference shows at x - d.
+fn moved_to(reference: &Image<f32>, dx: f64, dy: f64) -> Cow<'_, Image<f32>> {
+    if dx == 0.0 && dy == 0.0 {
+        return Cow::Borrowed(reference);
+    }
+    Cow::Owned(shifted(reference, -dx, -dy))
+}
+
 /// Brightness of a row relative to the reference: median of the ratios of its brighter pixels.
 fn brightness(reference: &[f32], row: &[f32], ratios: &mut Vec<f32>) -> f32 {
-    let step = (row.len() / 80).max(1);
+    let step = (row.len() / 40).max(1);
     ratios.clear();
     let pairs = reference.iter().zip(row).step_by(step);
     ratios.extend(pairs.filter(|(r, _)| **r > 16.0).map(|(r, v)| v / r));

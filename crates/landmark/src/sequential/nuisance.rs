@@ -28,20 +28,21 @@ pub struct Nuisance {
 
 impl Nuisance {
     /// The nuisances of a window: a constant always, the others when they are there.
-    pub fn of(history: &History) -> Self {
+    pub fn of(history: &History, lamps: &Lamps) -> Self {
         let n = history.len();
         let mut nuisance = Nuisance { basis: Vec::new(), frames: n };
         nuisance.add(vec![1.0; n]);
-        if n < DRIFT_FRAMES {
-            return nuisance;
+        if n >= DRIFT_FRAMES {
+            nuisance.add(history.frames().iter().map(|p| p.time as f32).collect());
         }
-        nuisance.add(history.frames().iter().map(|p| p.time as f32).collect());
         if history.shake() > STILL_PX {
             nuisance.add(history.frames().iter().map(|p| p.placement.dx as f32).collect());
             nuisance.add(history.frames().iter().map(|p| p.placement.dy as f32).collect());
         }
-        for lamp in lamps(history) {
-            nuisance.add(lamp);
+        for strengths in &lamps.strengths {
+            nuisance.add(
+                history.frames().iter().map(|p| dot(&p.placement.row_gain, strengths)).collect(),
+            );
         }
         nuisance
     }
@@ -66,6 +67,12 @@ impl Nuisance {
         }
     }
 
+    /// Squared length of a time course once the nuisances are taken out.
+    pub fn rest2(&self, course: &[f32]) -> f32 {
+        let taken: f32 = self.basis.iter().map(|vector| dot(vector, course).powi(2)).sum();
+        (dot(course, course) - taken).max(0.0)
+    }
+
     fn add(&mut self, mut vector: Vec<f32>) {
         let before = dot(&vector, &vector);
         // Twice, as rounding leaves a rest the first time.
@@ -82,39 +89,66 @@ impl Nuisance {
 
 /// The two strongest common changes of the rows' brightness: one lamp under a rolling shutter has a
 /// sine and a cosine part.
-fn lamps(history: &History) -> Vec<Vec<f32>> {
-    let n = history.len();
-    let rows = history.frames().front().map_or(0, |p| p.placement.row_gain.len());
-    // Rows over frames, the mean of each row taken out, smoothed over a band of rows: a tag fills
-    // few columns of few rows and must not pass for a lamp.
-    let mut table = vec![0.0f32; rows * n];
-    for (t, past) in history.frames().iter().enumerate() {
-        let gain = &past.placement.row_gain;
-        for r in 0..rows {
-            let band = &gain[r.saturating_sub(4)..(r + 5).min(rows)];
-            table[r * n + t] = band.iter().sum::<f32>() / band.len() as f32;
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Lamps {
+    /// Strength in every row; the brightness of the rows of a frame times it is the lamp's course.
+    strengths: Vec<Vec<f32>>,
+}
+
+impl Lamps {
+    /// The lamps of a window.
+    pub fn of(history: &History) -> Self {
+        let n = history.len();
+        let rows = history.frames().front().map_or(0, |p| p.placement.row_gain.len());
+        let mut table = vec![0.0f32; rows * n];
+        for (t, past) in history.frames().iter().enumerate() {
+            for (row, gain) in past.placement.row_gain.iter().enumerate() {
+                table[row * n + t] = *gain;
+            }
         }
-    }
-    for row in table.chunks_exact_mut(n) {
-        let mean = row.iter().sum::<f32>() / n as f32;
-        row.iter_mut().for_each(|v| *v -= mean);
-    }
-    let mut found: Vec<Vec<f32>> = Vec::new();
-    for _ in 0..2 {
-        let Some((direction, strengths)) = strongest(&table, n) else { break };
-        let total: f64 = strengths.iter().map(|s| f64::from(s * s)).sum();
-        let fourth: f64 = strengths.iter().map(|s| f64::from(s * s).powi(2)).sum();
-        let spread = total * total / (fourth * rows as f64).max(1e-300);
-        let level = (total / (rows * n) as f64).sqrt();
-        if level < LAMP_FLOOR || spread < LAMP_SPREAD {
-            break;
+        for row in table.chunks_exact_mut(n.max(1)) {
+            let mean = row.iter().sum::<f32>() / n as f32;
+            row.iter_mut().for_each(|v| *v -= mean);
         }
-        for (row, strength) in table.chunks_exact_mut(n).zip(&strengths) {
-            row.iter_mut().zip(&direction).for_each(|(v, d)| *v -= strength * d);
+        let mut lamps = Lamps::default();
+        if n < DRIFT_FRAMES {
+            return lamps;
         }
-        found.push(direction);
+        for _ in 0..2 {
+            let everything = dot(&table, &table) / table.len().max(1) as f32;
+            if f64::from(everything) < LAMP_FLOOR * LAMP_FLOOR {
+                break;
+            }
+            let Some((direction, strengths)) = strongest(&table, n) else { break };
+            let total: f64 = strengths.iter().map(|s| f64::from(s * s)).sum();
+            let fourth: f64 = strengths.iter().map(|s| f64::from(s * s).powi(2)).sum();
+            let spread = total * total / (fourth * rows as f64).max(1e-300);
+            let level = (total / (rows * n) as f64).sqrt();
+            if level < LAMP_FLOOR || spread < LAMP_SPREAD {
+                break;
+            }
+            for (row, strength) in table.chunks_exact_mut(n).zip(&strengths) {
+                row.iter_mut().zip(&direction).for_each(|(v, d)| *v -= strength * d);
+            }
+            lamps.strengths.push(strengths);
+        }
+        lamps
     }
-    found
+}
+
+/// The brightness of every row relative to the reference, smoothed over a band of rows: a tag fills
+/// few columns of few rows and must not pass for a lamp.
+pub fn smoothed(gain: &[f32]) -> Vec<f32> {
+    let mut sums = Vec::with_capacity(gain.len() + 1);
+    sums.push(0.0f64);
+    for g in gain {
+        sums.push(sums[sums.len() - 1] + f64::from(*g));
+    }
+    let band = |r: usize| (r.saturating_sub(4), (r + 5).min(gain.len()));
+    (0..gain.len())
+        .map(band)
+        .map(|(from, to)| ((sums[to] - sums[from]) / (to - from) as f64) as f32)
+        .collect()
 }
 
 /// The strongest common time course of the rows (unit length) and its strength in each: power

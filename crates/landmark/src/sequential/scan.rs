@@ -2,24 +2,28 @@
 //!
 //! A light too weak to stand out of the noise in any single frame still varies a little more than its
 //! neighbours, and varies at its pattern's frequencies only. The pixels that vary more than their
-//! neighbours, about one in nine, are tested for every pattern's lines; the best few places a pattern
-//! go on. Choosing by rank, not by a threshold, keeps the cost constant and needs no noise model.
+//! neighbours, about one in nine, and not much less than a light would that is nearly decided, are
+//! tested for the lines of the patterns; patterns of one length and chip have the same lines and are
+//! tested at once. The best few places go on. Choosing by rank, not by a threshold on the evidence,
+//! keeps the cost constant and needs no noise model.
 
-use vergence_tag::Pattern;
+use std::ops::Range;
 
 use super::front::{GAIN, NOISE_GAIN};
 use super::history::History;
 use super::nuisance::{Nuisance, dot};
-use super::template::lines;
 
 /// Side of a block (px).
 pub const BLOCK: usize = 16;
 
-/// Places a pattern that go on from a scan.
-const PER_PATTERN: usize = 24;
+/// Places that go on from a scan for a family of patterns, and for each pattern beyond the first.
+const PER_FAMILY: (usize, usize) = (24, 4);
+
+/// Most places that go on for a family.
+const MOST_PER_FAMILY: usize = 96;
 
 /// Places that go on for their energy alone.
-const BY_ENERGY: usize = 48;
+pub const BY_ENERGY: usize = 48;
 
 /// Distance from the border (px) within which nothing is looked for.
 pub const MARGIN: usize = 4;
@@ -46,7 +50,8 @@ impl BlockNoise {
             values.clear();
             for y in (y0..(y0 + BLOCK).min(height)).step_by(2) {
                 let row = &energy[y * width + x0..y * width + (x0 + BLOCK).min(width)];
-                values.extend_from_slice(row);
+                // Neighbours see the same noise; every second pixel says nearly as much as all.
+                values.extend(row.iter().skip(y / 2 % 2).step_by(2));
             }
             let middle = values.len() / 2;
             let median = *values.select_nth_unstable_by(middle, f32::total_cmp).1;
@@ -66,6 +71,14 @@ impl BlockNoise {
         f64::from(self.variance.get(block).copied().unwrap_or(LEAST_VARIANCE) / (GAIN * GAIN))
     }
 
+    /// `factor` times the noise along a row (filter units squared), for every column.
+    fn along(&self, y: usize, factor: f32, out: &mut [f32]) {
+        let blocks = &self.variance[y / BLOCK * self.across..];
+        for (part, variance) in out.chunks_mut(BLOCK).zip(blocks) {
+            part.fill(factor * variance);
+        }
+    }
+
     /// Median over the picture of the noise variance (grey levels squared).
     pub fn median(&self) -> f64 {
         let mut sorted = self.variance.clone();
@@ -75,60 +88,75 @@ impl BlockNoise {
 }
 
 /// A pixel that may hold a light.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Candidate {
     /// Column and row in the first frame.
     pub pixel: (usize, usize),
-    /// The request for whose lines it was chosen; `None`: it varies strongly, whatever its pattern.
-    pub request: Option<usize>,
+    /// The requests for which it was chosen.
+    pub requests: Vec<usize>,
 }
 
-/// Pixels that vary far more than their block: strong lights, found without waiting for a scan.
+/// A pixel that varies far more than its block.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Strong {
+    /// Column and row in the first frame.
+    pub pixel: (usize, usize),
+    /// Whether chance would not explain it in any picture.
+    pub restless: bool,
+}
+
+/// Pixels that vary far more than their block: strong lights, found without waiting for a scan, and
+/// whatever else is restless; most outstanding first.
 pub fn by_energy(
     energy: &[f32],
     width: usize,
     height: usize,
     frames: usize,
     noise: &BlockNoise,
-) -> Vec<Candidate> {
+) -> Vec<Strong> {
     // Five standard deviations of the chi-square above its mean.
-    let freedom = frames.saturating_sub(1).max(1) as f32;
-    let limit = freedom * (1.0 + 5.0 * (2.0 / freedom).sqrt());
+    let limit = chi_square(frames, 5.0);
+    let mut limits = vec![0.0; width];
     let mut found: Vec<(f32, (usize, usize))> = Vec::new();
     for y in MARGIN..height - MARGIN {
-        let blocks = &noise.variance[y / BLOCK * noise.across..];
-        for (bx, variance) in blocks[..noise.across].iter().enumerate() {
-            let (from, to) = ((bx * BLOCK).max(MARGIN), ((bx + 1) * BLOCK).min(width - MARGIN));
-            if from >= to {
-                continue;
-            }
-            let row = &energy[y * width + from..y * width + to];
-            if !exceeds(row, limit * variance) {
-                continue;
-            }
-            let around = [y - 1, y, y + 1].map(|v| &energy[v * width..(v + 1) * width]);
-            for x in from..to {
-                let here = energy[y * width + x];
-                if here > limit * variance && is_peak(around, x) {
-                    found.push((here / variance, (x, y)));
-                }
+        if y == MARGIN || y % BLOCK == 0 {
+            noise.along(y, limit, &mut limits);
+        }
+        let columns = MARGIN..width - MARGIN;
+        let row = &energy[y * width..(y + 1) * width];
+        if !exceeds(&row[columns.clone()], &limits[columns.clone()]) {
+            continue;
+        }
+        let around = [y - 1, y, y + 1].map(|v| &energy[v * width..(v + 1) * width]);
+        for x in columns {
+            if row[x] > limits[x] && is_peak(around, x) {
+                found.push((row[x] / limits[x], (x, y)));
             }
         }
     }
     found.sort_by(|a, b| b.0.total_cmp(&a.0));
-    let mut kept: Vec<Candidate> = Vec::new();
-    for (_, pixel) in found {
-        if kept.len() == BY_ENERGY {
-            break;
-        }
-        kept.push(Candidate { pixel, request: None });
-    }
-    kept
+    let certain = certain(frames) / limit;
+    let strong = |(excess, pixel)| Strong { pixel, restless: excess > certain };
+    found.into_iter().map(strong).collect()
+}
+
+/// What noise of unit variance adds up to by chance once in three million times (Wilson and
+/// Hilferty's cube for the chi-square, at five standard deviations).
+fn certain(frames: usize) -> f32 {
+    let freedom = frames.saturating_sub(1).max(1) as f32;
+    let spread = 2.0 / (9.0 * freedom);
+    freedom * (1.0 - spread + 5.0 * spread.sqrt()).powi(3)
+}
+
+/// What noise of unit variance adds up to over so many frames, and `above` standard deviations more.
+fn chi_square(frames: usize, above: f32) -> f32 {
+    let freedom = frames.saturating_sub(1).max(1) as f32;
+    freedom * (1.0 + above * (2.0 / freedom).sqrt())
 }
 
 #[multiversion::multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
-fn exceeds(values: &[f32], limit: f32) -> bool {
-    values.iter().fold(false, |any, v| any | (*v > limit))
+fn exceeds(values: &[f32], limits: &[f32]) -> bool {
+    values.iter().zip(limits).fold(false, |any, (v, limit)| any | (v > limit))
 }
 
 fn is_peak(rows: [&[f32]; 3], x: usize) -> bool {
@@ -136,69 +164,106 @@ fn is_peak(rows: [&[f32]; 3], x: usize) -> bool {
     rows.iter().all(|row| row[x - 1..=x + 1].iter().all(|v| *v <= here))
 }
 
-/// Tests the varying pixels for every pattern's lines; the best places a pattern, best first.
+/// Patterns whose spectra have the same lines.
+pub struct Family {
+    /// Their requests.
+    pub requests: Vec<usize>,
+    /// The lines over the window, orthonormal and free of nuisances.
+    pub lines: Vec<Vec<f32>>,
+}
+
+/// Tests the varying pixels for the lines of every family; the best places of each.
+///
+/// `presence`: log likelihood ratio of a light that is decided.
 pub fn by_lines(
     history: &History,
     energy: &[f32],
-    width: usize,
-    height: usize,
+    (width, height): (usize, usize),
     noise: &BlockNoise,
     nuisance: &Nuisance,
-    patterns: &[Option<&Pattern>],
+    families: &[Family],
+    presence: f64,
 ) -> Vec<Candidate> {
-    let times = history.times();
-    let sets: Vec<Vec<Vec<f32>>> = patterns
-        .iter()
-        .map(|p| p.map_or_else(Vec::new, |pattern| lines(pattern, &times, nuisance)))
-        .collect();
-    let mut best: Vec<Vec<(f32, (usize, usize))>> = vec![Vec::new(); patterns.len()];
-    let mut series = Vec::with_capacity(times.len());
-    for (x, y) in peaks(energy, width, height) {
-        history.series_at((x, y), &mut series);
-        nuisance.remove(&mut series);
-        let total = dot(&series, &series) + 40.0 * noise.at(x, y) as f32;
-        for (request, set) in sets.iter().enumerate().filter(|(_, set)| !set.is_empty()) {
-            let explained: f32 = set.iter().map(|line| dot(line, &series).powi(2)).sum();
-            let freedom = times.len() as f32 + 40.0;
-            // Twice the log likelihood ratio, less what the number of lines gains by chance.
-            let score = -freedom * (-explained / total).ln_1p() - set.len() as f32;
-            keep_best(&mut best[request], score, (x, y));
-        }
-    }
-    let candidate = |request| move |(_, pixel)| Candidate { pixel, request: Some(request) };
-    best.into_iter().enumerate().flat_map(|(r, list)| list.into_iter().map(candidate(r))).collect()
-}
-
-/// Keeps a list of the best places, no two of them neighbours.
-fn keep_best(list: &mut Vec<(f32, (usize, usize))>, score: f32, pixel: (usize, usize)) {
-    if list.len() == PER_PATTERN && list.last().is_some_and(|worst| worst.0 >= score) {
-        return;
-    }
-    let near = |p: (usize, usize)| p.0.abs_diff(pixel.0).max(p.1.abs_diff(pixel.1)) <= 2;
-    if let Some(k) = list.iter().position(|(_, p)| near(*p)) {
-        if list[k].0 >= score {
-            return;
-        }
-        list.remove(k);
-    }
-    let at = list.partition_point(|(s, _)| *s >= score);
-    list.insert(at, (score, pixel));
-    list.truncate(PER_PATTERN);
-}
-
-/// The pixels that vary more than their eight neighbours, one in nine: an edge that sways is a ridge
-/// of many pixels but few peaks, and cannot crowd out a light.
-fn peaks(energy: &[f32], width: usize, height: usize) -> Vec<(usize, usize)> {
-    let mut chosen = Vec::new();
+    let n = history.len();
+    let limit = chi_square(n, least_excess(n, presence));
+    let mut best: Vec<Best> = families.iter().map(|f| Best::of(f.requests.len())).collect();
+    let (mut table, mut columns) = (Vec::new(), Vec::with_capacity(width / 2));
+    let mut limits = vec![0.0; width];
     for y in MARGIN..height - MARGIN {
-        let row = |y: usize| &energy[y * width..(y + 1) * width];
-        let (above, here, below) = (row(y - 1), row(y), row(y + 1));
-        for x in MARGIN..width - MARGIN {
-            let e = here[x];
-            if e >= here[x - 1] && e > here[x + 1] && is_peak([above, here, below], x) {
-                chosen.push((x, y));
+        if y == MARGIN || y % BLOCK == 0 {
+            noise.along(y, limit, &mut limits);
+        }
+        columns.clear();
+        peaks(energy, width, y, &limits, &mut columns);
+        history.series_of_row(y, &columns, &mut table);
+        for (series, &x) in table.chunks_exact_mut(n.max(1)).zip(&columns) {
+            nuisance.remove(series);
+            let total = dot(series, series) + 40.0 * noise.at(x, y) as f32;
+            for (family, best) in families.iter().zip(&mut best) {
+                let explained: f32 = family.lines.iter().map(|l| dot(l, series).powi(2)).sum();
+                let freedom = n as f32 + 40.0;
+                // Twice the log likelihood ratio, less what the number of lines gains by chance.
+                let score = -freedom * (-explained / total).ln_1p() - family.lines.len() as f32;
+                best.keep(score, (x, y));
             }
         }
     }
-    chosen
+    let mut candidates = Vec::new();
+    for (family, best) in families.iter().zip(best) {
+        let requests = &family.requests;
+        let candidate = |(_, pixel)| Candidate { pixel, requests: requests.clone() };
+        candidates.extend(best.list.into_iter().map(candidate));
+    }
+    candidates
+}
+
+/// By how many standard deviations of chance the energy of a light exceeds the noise when its evidence
+/// reaches `presence`: less what a place between pixels and bad luck cost.
+fn least_excess(frames: usize, presence: f64) -> f32 {
+    // Twice the log likelihood ratio is the light's energy over the noise; in the worst place between
+    // pixels 0.6 of it shows. One standard deviation may be missing by chance.
+    let excess = 0.6 * 2.0 * presence / (2.0 * frames as f64).sqrt();
+    (excess - 1.0).max(0.0) as f32
+}
+
+/// A list of the best places, no two of them neighbours, best first.
+struct Best {
+    list: Vec<(f32, (usize, usize))>,
+    most: usize,
+}
+
+impl Best {
+    fn of(patterns: usize) -> Self {
+        let most = PER_FAMILY.0 + PER_FAMILY.1 * patterns.saturating_sub(1);
+        Best { list: Vec::new(), most: most.min(MOST_PER_FAMILY) }
+    }
+
+    fn keep(&mut self, score: f32, pixel: (usize, usize)) {
+        let list = &mut self.list;
+        if list.len() == self.most && list.last().is_some_and(|worst| worst.0 >= score) {
+            return;
+        }
+        let near = |p: (usize, usize)| p.0.abs_diff(pixel.0).max(p.1.abs_diff(pixel.1)) <= 2;
+        if let Some(k) = list.iter().position(|(_, p)| near(*p)) {
+            if list[k].0 >= score {
+                return;
+            }
+            list.remove(k);
+        }
+        let at = list.partition_point(|(s, _)| *s >= score);
+        list.insert(at, (score, pixel));
+        list.truncate(self.most);
+    }
+}
+
+/// The columns of a row in which the pixels vary more than `limits` and than their eight neighbours:
+/// an edge that sways is a ridge of many pixels but few peaks, and cannot crowd out a light.
+fn peaks(energy: &[f32], width: usize, y: usize, limits: &[f32], columns: &mut Vec<usize>) {
+    let row = |y: usize| &energy[y * width..(y + 1) * width];
+    let (above, here, below) = (row(y - 1), row(y), row(y + 1));
+    let inside: Range<usize> = MARGIN..width - MARGIN;
+    columns.extend(inside.filter(|&x| {
+        let e = here[x];
+        e > limits[x] && e >= here[x - 1] && e > here[x + 1] && is_peak([above, here, below], x)
+    }));
 }

@@ -40,6 +40,11 @@ pub fn shifted<T: Copy + Into<f32>>(image: &Image<T>, dx: f64, dy: f64) -> Image
     out
 }
 
+/// The nearest whole number, without a call of the C library for every pixel.
+pub fn rounded(value: f32) -> i16 {
+    ((value + 32_768.5) as i32 - 32_768) as i16
+}
+
 #[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
 fn along_row(out: &mut [f32], padded: &[f32], w: [f32; 4]) {
     let n = out.len();

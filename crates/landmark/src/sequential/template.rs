@@ -1,6 +1,7 @@
 //! The light that a pattern would give over a window, for a bank of phases and clock rates.
 
 use std::f64::consts::TAU;
+use std::ops::Range;
 
 use vergence_tag::Pattern;
 
@@ -28,82 +29,140 @@ pub struct Hypothesis {
     pub norm2: f64,
 }
 
-/// The expected light for all phases and rates of one pattern, freed of nuisances, of unit length.
+/// The expected light for all phases and rates of one pattern. It grows by a column a frame: nothing
+/// is computed twice.
 #[derive(Debug, Clone)]
 pub struct Bank {
-    /// The hypotheses.
+    pattern: Pattern,
+    /// The hypotheses; `norm2` is that of the last [`Bank::fit`].
     pub hypotheses: Vec<Hypothesis>,
+    /// Share of light, `capacity` frames a hypothesis, of which the used are in `used`.
     templates: Vec<f32>,
-    frames: usize,
+    capacity: usize,
+    used: Range<usize>,
+    /// Numbers of the frames in `used`, counted from the first frame ever.
+    frames: Range<usize>,
+    /// Frame number for which the lengths were computed.
+    fitted: usize,
+    /// Reciprocal length of every expected light, nuisances taken out; zero where too short.
+    scales: Vec<f32>,
     /// Step of the phase (s).
     pub step: f64,
 }
 
 impl Bank {
-    /// The bank of a pattern over a window.
+    /// An empty bank for a window of so many frames, at the clock rates `rates`. `fine`: follow
+    /// changes of the light inside the exposure.
     pub fn new(
-        pattern: &Pattern,
-        tolerance: f64,
-        times: &[(f64, f64)],
-        nuisance: &Nuisance,
-    ) -> Self {
-        let rates = rates(pattern, tolerance, times);
-        Bank::with_rates(pattern, &rates, times, nuisance)
-    }
-
-    /// The bank of a pattern for given clock rates.
-    pub fn with_rates(
         pattern: &Pattern,
         rates: &[f64],
         times: &[(f64, f64)],
-        nuisance: &Nuisance,
+        window: usize,
+        fine: bool,
     ) -> Self {
-        let (period, chip) = (pattern.period().as_secs_f64(), pattern.chip.as_secs_f64());
-        let between = gap(times).max(1e-4);
-        let mut fine = PHASE_STEP * chip.min(between).max(0.25 * chip);
-        // Where a chip lasts a whole number of frames, every change falls at the same point of an
-        // exposure: inside it, all frames are half lit, and only a step as fine as that tells.
-        let frames = chip / between;
-        if (frames - frames.round()).abs() < 0.05 * frames {
-            let exposure = times.first().map_or(0.0, |t| t.1);
-            fine = fine.min((0.5 * exposure).max(chip / 16.0));
-        }
-        let phases = (period / fine).ceil() as usize;
+        let period = pattern.period().as_secs_f64();
+        let phases = (period / phase_step(pattern, times, fine)).ceil() as usize;
         let step = period / phases as f64;
-        let mut bank = Bank {
-            hypotheses: Vec::with_capacity(phases * rates.len()),
-            templates: Vec::with_capacity(phases * rates.len() * times.len()),
-            frames: times.len(),
+        let hypotheses: Vec<Hypothesis> = rates
+            .iter()
+            .flat_map(|&rate| (0..phases).map(move |k| (k as f64 * step, rate)))
+            .map(|(phase, rate)| Hypothesis { phase, rate, norm2: 0.0 })
+            .collect();
+        // Twice the window: the past is moved back to the start once a window, not every frame.
+        let capacity = 2 * window;
+        Bank {
+            pattern: *pattern,
+            templates: vec![0.0; capacity * hypotheses.len()],
+            scales: vec![0.0; hypotheses.len()],
+            hypotheses,
+            capacity,
+            used: 0..0,
+            frames: 0..0,
+            fitted: 0,
             step,
-        };
-        let mut expected = Vec::with_capacity(times.len());
-        for &rate in rates {
-            for k in 0..phases {
-                let phase = k as f64 * step;
-                light(pattern, times, phase, rate, &mut expected);
-                nuisance.remove(&mut expected);
-                let norm2 = f64::from(dot(&expected, &expected));
-                // A phase whose light never changes within the window says nothing.
-                if norm2 > 1e-3 {
-                    let scale = norm2.sqrt().recip() as f32;
-                    bank.templates.extend(expected.iter().map(|v| v * scale));
-                    bank.hypotheses.push(Hypothesis { phase, rate, norm2 });
-                }
-            }
         }
-        bank
     }
 
-    /// Scalar product of a series with every hypothesis.
+    /// Whether the bank has so many clock rates.
+    pub fn has_rates(&self, count: usize) -> bool {
+        let first = self.hypotheses.first().map(|h| h.phase);
+        self.hypotheses.iter().filter(|h| Some(h.phase) == first).count() == count
+    }
+
+    /// Brings the bank up to a window whose frames have the numbers `frames` (from the first frame
+    /// ever) and whose nuisances are given.
+    pub fn fit(&mut self, times: &[(f64, f64)], frames: Range<usize>, nuisance: &Nuisance) {
+        if self.fitted == frames.end {
+            return;
+        }
+        self.fitted = frames.end;
+        self.advance(times, frames);
+        for ((h, scale), light) in self
+            .hypotheses
+            .iter_mut()
+            .zip(&mut self.scales)
+            .zip(self.templates.chunks_exact(self.capacity))
+        {
+            let norm2 = nuisance.rest2(&light[self.used.clone()]);
+            h.norm2 = f64::from(norm2);
+            // A phase whose light never changes within the window says nothing.
+            *scale = if norm2 > 1e-3 { norm2.sqrt().recip() } else { 0.0 };
+        }
+    }
+
+    /// Drops the frames that left the window and adds those that entered.
+    fn advance(&mut self, times: &[(f64, f64)], frames: Range<usize>) {
+        let known = self.frames.start..self.frames.end.max(frames.start);
+        let dropped = frames.start.saturating_sub(known.start).min(self.used.len());
+        self.used.start += dropped;
+        let new = &times[times.len() - (frames.end - known.end).min(times.len())..];
+        if self.used.end + new.len() > self.capacity {
+            let used = self.used.clone();
+            for light in self.templates.chunks_exact_mut(self.capacity) {
+                light.copy_within(used.clone(), 0);
+            }
+            self.used = 0..used.len();
+        }
+        let at = self.used.end;
+        for (h, light) in self.hypotheses.iter().zip(self.templates.chunks_exact_mut(self.capacity))
+        {
+            for (value, &(t, e)) in light[at..].iter_mut().zip(new) {
+                *value = self.pattern.on_fraction(h.phase + h.rate * t, h.rate * e) as f32;
+            }
+        }
+        self.used.end += new.len();
+        self.frames = frames;
+    }
+
+    /// Scalar product of a series that is free of nuisances with every expected light of unit length.
     pub fn correlate(&self, series: &[f32], out: &mut Vec<f32>) {
         out.clear();
-        out.extend(self.templates.chunks_exact(self.frames.max(1)).map(|t| dot(t, series)));
+        let lights = self.templates.chunks_exact(self.capacity);
+        out.extend(
+            lights
+                .zip(&self.scales)
+                .map(|(light, scale)| dot(&light[self.used.clone()], series) * scale),
+        );
     }
 }
 
-/// Clock rates close enough that the pattern stays within a quarter of a chip over the window.
-fn rates(pattern: &Pattern, tolerance: f64, times: &[(f64, f64)]) -> Vec<f64> {
-    let span = times.last().map_or(0.0, |l| l.0) - times.first().map_or(0.0, |f| f.0);
+/// Step of the phase in a bank (s).
+fn phase_step(pattern: &Pattern, times: &[(f64, f64)], fine: bool) -> f64 {
+    let chip = pattern.chip.as_secs_f64();
+    let between = gap(times).max(1e-4);
+    let step = PHASE_STEP * chip.min(between).max(0.25 * chip);
+    // Where a chip lasts a whole number of frames, every change falls at the same point of an
+    // exposure: inside it, all frames are half lit, and only a step as fine as that tells.
+    let frames = chip / between;
+    if fine && (frames - frames.round()).abs() < 0.05 * frames {
+        let exposure = times.first().map_or(0.0, |t| t.1);
+        return step.min((0.5 * exposure).max(chip / 16.0));
+    }
+    step
+}
+
+/// Clock rates close enough that the pattern stays within a quarter of a chip over `span` seconds.
+pub fn rates(pattern: &Pattern, tolerance: f64, span: f64) -> Vec<f64> {
     let drift = tolerance * span / (PHASE_STEP * pattern.chip.as_secs_f64());
     let each_side = if drift > 0.5 { drift.ceil() as i64 } else { 0 };
     let rate = |k: i64| 1.0 + tolerance * k as f64 / each_side.max(1) as f64;
@@ -125,30 +184,44 @@ pub fn transitions(pattern: &Pattern, times: &[(f64, f64)]) -> f64 {
     changes as f64 * span / pattern.period().as_secs_f64()
 }
 
-/// The lines of a pattern's spectrum as an orthonormal set, freed of nuisances: any phase of the
-/// pattern lies in its span, so one pass over a pixel tests all phases at once.
-pub fn lines(pattern: &Pattern, times: &[(f64, f64)], nuisance: &Nuisance) -> Vec<Vec<f32>> {
-    let (period, n) = (pattern.period().as_secs_f64(), pattern.bits.len());
-    let mut strengths: Vec<(usize, f64)> = Vec::new();
-    for k in 1..=n.max(3) {
-        let turn = TAU * k as f64 / n as f64;
-        let (mut re, mut im) = (0.0, 0.0);
-        for (j, _) in pattern.bits.chips().enumerate().filter(|(_, on)| *on) {
-            re += (turn * j as f64).cos();
-            im += (turn * j as f64).sin();
+/// The lines of the spectra of patterns that share length and chip, as an orthonormal set freed of
+/// nuisances: any phase of any of them lies in its span, so one pass over a pixel tests all at once.
+pub fn lines(patterns: &[&Pattern], times: &[(f64, f64)], nuisance: &Nuisance) -> Vec<Vec<f32>> {
+    let Some(first) = patterns.first() else { return Vec::new() };
+    let mut strengths = vec![0.0f64; first.bits.len().max(3)];
+    for pattern in patterns {
+        for (s, own) in strengths.iter_mut().zip(spectrum(pattern)) {
+            *s = s.max(own);
         }
-        let half = 0.5 * turn;
-        strengths.push((k, f64::hypot(re, im) * (half.sin() / half).abs()));
     }
-    let largest = strengths.iter().map(|s| s.1).fold(0.0, f64::max);
-    strengths.retain(|s| s.1 > 0.3 * largest);
+    let strong = strengths.iter().enumerate().filter(|(_, s)| **s > 0.3).map(|(k, _)| k + 1);
+    orthonormal(first.period().as_secs_f64(), strong, times, |line| nuisance.remove(line))
+}
+
+/// The lines that any code of a pattern's length and chip may have, as an orthonormal set that
+/// `clear` has freed of nuisances.
+pub fn every_line(
+    pattern: &Pattern,
+    times: &[(f64, f64)],
+    clear: impl Fn(&mut [f32]),
+) -> Vec<Vec<f32>> {
+    orthonormal(pattern.period().as_secs_f64(), 1..=pattern.bits.len() / 2, times, clear)
+}
+
+/// Cosine and sine at multiples of the fundamental, orthonormal.
+fn orthonormal(
+    period: f64,
+    multiples: impl Iterator<Item = usize>,
+    times: &[(f64, f64)],
+    clear: impl Fn(&mut [f32]),
+) -> Vec<Vec<f32>> {
     let mut set: Vec<Vec<f32>> = Vec::new();
-    for (k, _) in strengths {
+    for k in multiples {
         for quarter in [0.0, 0.25] {
             // The middle of the exposure is where a line's phase is read.
             let angle = |&(t, e): &(f64, f64)| TAU * (k as f64 * (t + 0.5 * e) / period + quarter);
             let mut line: Vec<f32> = times.iter().map(|t| angle(t).cos() as f32).collect();
-            nuisance.remove(&mut line);
+            clear(&mut line);
             for other in &set {
                 let share = dot(other, &line);
                 line.iter_mut().zip(other).for_each(|(l, o)| *l -= share * o);
@@ -161,4 +234,23 @@ pub fn lines(pattern: &Pattern, times: &[(f64, f64)], nuisance: &Nuisance) -> Ve
         }
     }
     set
+}
+
+/// Strength of the multiples of a pattern's fundamental, from the first, relative to the strongest.
+fn spectrum(pattern: &Pattern) -> Vec<f64> {
+    let n = pattern.bits.len();
+    let strength = |k: usize| {
+        let turn = TAU * k as f64 / n as f64;
+        let (mut re, mut im) = (0.0, 0.0);
+        for (j, _) in pattern.bits.chips().enumerate().filter(|(_, on)| *on) {
+            re += (turn * j as f64).cos();
+            im += (turn * j as f64).sin();
+        }
+        let half = 0.5 * turn;
+        f64::hypot(re, im) * (half.sin() / half).abs()
+    };
+    let mut strengths: Vec<f64> = (1..=n.max(3)).map(strength).collect();
+    let largest = strengths.iter().copied().fold(1e-9, f64::max);
+    strengths.iter_mut().for_each(|s| *s /= largest);
+    strengths
 }

@@ -12,7 +12,7 @@ use vergence_landmark::sequential::{Config, SequentialFinder};
 use vergence_landmark::synthetic::{Light, Patch, Scene};
 use vergence_landmark::{Decision, Finder, Request};
 use vergence_tag::Pattern;
-use vergence_tag::codebook::{self, Rules};
+use vergence_tag::codebook;
 use vergence_tag::pattern::Bits;
 
 use crate::failure::Failure;
@@ -32,8 +32,8 @@ const FILTER_NOISE: f64 = 0.865;
 /// Chance of a false report or a wrong name that the bounds are computed for.
 const ALPHA: f64 = 1e-3;
 
-/// Hypotheses over a whole picture in the Wald bound: 24.4 k places, 16 codes of 16 phases.
-const HYPOTHESES: f64 = 24.4e3 * 16.0 * 16.0;
+/// Hypotheses over a whole picture in the Wald bound: 24.4 k places, 16 codes of 18 phases.
+const HYPOTHESES: f64 = 24.4e3 * 16.0 * 18.0;
 
 /// Everything that was simulated.
 #[derive(Debug, Serialize)]
@@ -81,18 +81,14 @@ pub fn run(runs: usize, minutes: f64) -> Result<Bound, Failure> {
     Ok(Bound { frames_to_decision, tag_free: tag_free(minutes)? })
 }
 
-/// Sixteen balanced codes of 16 chips, distance 4, one chip a frame at 30 frames/s.
+/// The first sixteen patterns that the system assigns at 30 frames/s: 18 chips of one frame.
 fn requests() -> Result<Vec<Request>, Failure> {
-    let rules = Rules { length: 16, third_null: false, longest_run: 16, ..Rules::MANY };
-    let mut book = [Bits::FLICKER; 16];
-    codebook::fill(&rules, &mut book);
-    let chip = Duration::from_secs_f64(1.0 / 30.0);
-    let defect = |e| Failure::failed(e, "report this as a defect");
-    let request = |(k, bits): (usize, &Bits)| {
-        let pattern = Pattern::new(*bits, chip).map_err(defect)?;
+    let missing = || Failure::failed("the code book is too short", "report this as a defect");
+    let request = |k: usize| {
+        let pattern = codebook::assign(k, 30.0).ok_or_else(missing)?;
         Ok(Request { id: k.to_string(), pattern, clock_tolerance: 1e-4 })
     };
-    book.iter().enumerate().map(request).collect()
+    (0..16).map(request).collect()
 }
 
 /// The finder of a tile: its share of the false alarms of a 640x480 picture.
@@ -204,10 +200,24 @@ fn tag_free(minutes: f64) -> Result<TagFree, Failure> {
 /// One tag-free scene: everything at once, differently in every run.
 fn hostile(run: usize, side: usize, requests: &[Request]) -> Scene {
     let at = |purpose: u64| 12.0 + draw(run, purpose) * (side as f64 - 24.0);
-    // Foreign tags: other codes, and requested patterns played at least 6 % too fast or too slow.
+    // Foreign tags: another code, and a requested pattern played at least 6 % too fast or too slow, and
+    // not at the rate of another requested one either.
     let other = requests[(draw(run, 11) * requests.len() as f64) as usize].pattern;
-    let rate =
-        if draw(run, 12) < 0.5 { 0.70 + 0.24 * draw(run, 13) } else { 1.06 + 0.3 * draw(run, 13) };
+    let off = |k: u64| {
+        if draw(run, 12 + 100 * k) < 0.5 {
+            0.70 + 0.24 * draw(run, 13 + 100 * k)
+        } else {
+            1.06 + 0.3 * draw(run, 13 + 100 * k)
+        }
+    };
+    let chip = other.chip.as_secs_f64();
+    let alike = |rate: &f64| {
+        requests.iter().filter(|r| r.pattern.bits == other.bits).any(|r| {
+            let ratio = chip / rate / r.pattern.chip.as_secs_f64();
+            (0.95..1.05).contains(&ratio)
+        })
+    };
+    let rate = (0..).map(off).find(|rate| !alike(rate)).unwrap_or(1.5);
     let foreign = codebook::challenge(
         run as u64,
         Duration::from_millis(33),
