@@ -197,7 +197,11 @@ impl std::fmt::Display for Missing {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum CalibrateError {
     /// The data do not determine the head; what is missing, the most important first.
-    #[error("the sightings do not determine the head: {}", list(.missing))]
+    #[error(
+        "the sightings do not determine the head, a distance of 1 m would be uncertain by {:.0} mm: {}",
+        1e3 * .distance_sigma,
+        list(.missing)
+    )]
     Unconstrained {
         /// Motions to add.
         missing: Vec<Missing>,
