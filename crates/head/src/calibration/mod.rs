@@ -12,7 +12,8 @@
 //!
 //! **Method.** Bundle adjustment: Levenberg-Marquardt on the pixels, each weighted by centroid and
 //! encoder noise, with Cauchy weights against wrong sightings, and a Gaussian prior on every unknown of
-//! a head ([`Priors`]). The priors also hold what no light can show: moving the whole head with all
+//! a head ([`Priors`]). In the end the encoders' rounding counts as what it is, bounded by half a step,
+//! which tells half as much again of coarse servos. The priors also hold what no light can show: moving the whole head with all
 //! lights, and the directions in which the parameters of one chain repeat each other. Angles and pixels
 //! alone know no size: one known length between two places of the light, or known places (an arm that
 //! holds it), gives the scale.
