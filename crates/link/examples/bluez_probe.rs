@@ -1,7 +1,8 @@
 //! Does with the tags of the example `tag_server` what a robot does, and checks the answers.
 //!
 //! ```text
-//! bluez_probe bluez       # through BlueZ
+//! bluez_probe bluez     # through BlueZ
+//! bluez_probe hci0      # our own host on the kernel's user channel; bluetoothd must not run
 //! ```
 //! `scripts/qemu_bluez.sh` runs it on a real kernel with a real daemon in a virtual machine. One line
 //! a check; the exit status is 0 when all passed.
@@ -9,12 +10,12 @@
 use std::error::Error;
 use std::time::{Duration, Instant};
 
-use vergence_devices::{DeviceError, LedCommand, TagAddress, TagLink};
-use vergence_link::BluezLink;
+use vergence_devices::{DeviceError, LedCommand, TagAddress};
+use vergence_link::{BluezLink, HciLink, LinkConfig, TagRadio};
 use vergence_tag::{Pattern, cbor, pattern::Bits};
 
 type Outcome = Result<String, Box<dyn Error>>;
-type Check = fn(&mut BluezLink) -> Outcome;
+type Check = fn(&mut dyn TagRadio) -> Outcome;
 
 const CUP: TagAddress = TagAddress([0xC0, 1, 2, 3, 4, 1]);
 /// Wants encryption.
@@ -27,8 +28,12 @@ const NOBODY: TagAddress = TagAddress([0xC0, 9, 9, 9, 9, 9]);
 const TIMEOUT: Duration = Duration::from_secs(10);
 
 fn main() -> Result<(), Box<dyn Error>> {
+    let mut link: Box<dyn TagRadio> = match std::env::args().nth(1).as_deref() {
+        Some("bluez") => Box::new(BluezLink::open(None)?),
+        Some("hci0") => Box::new(HciLink::linux(0, LinkConfig::default())?),
+        _ => return Err("bluez_probe bluez|hci0".into()),
+    };
     let mut failed = 0;
-    let mut link = BluezLink::open(None)?;
     let checks: [(&str, Check); 11] = [
         ("scan", scan),
         ("record", |link| record(link, CUP, "cup")),
@@ -40,11 +45,11 @@ fn main() -> Result<(), Box<dyn Error>> {
         ("pairing by passkey", |link| pair(link, BOX, Some(PASSKEY), "box")),
         ("wrong passkey", wrong),
         ("tag that is not there", nobody),
-        ("scan with tags that BlueZ knows", scan),
+        ("scan with tags that are known", scan),
     ];
     for (name, check) in checks {
         let begin = Instant::now();
-        let outcome = check(&mut link);
+        let outcome = check(&mut *link);
         let took = begin.elapsed().as_secs_f64() * 1e3;
         match outcome {
             Ok(figures) => println!("ok    {name} ({took:.0} ms): {figures}"),
@@ -63,7 +68,7 @@ fn ensure(good: bool, what: impl FnOnce() -> String) -> Result<(), Box<dyn Error
     if good { Ok(()) } else { Err(what().into()) }
 }
 
-fn scan(link: &mut BluezLink) -> Outcome {
+fn scan(link: &mut dyn TagRadio) -> Outcome {
     let heard = link.scan(Duration::from_secs(2))?;
     let mut ids: Vec<(&str, TagAddress, Option<u8>)> =
         heard.iter().map(|tag| (&*tag.object_id, tag.address, tag.battery)).collect();
@@ -74,14 +79,14 @@ fn scan(link: &mut BluezLink) -> Outcome {
     Ok("three tags with id, battery 80 % and -50 dBm".into())
 }
 
-fn record(link: &mut BluezLink, tag: TagAddress, id: &str) -> Outcome {
+fn record(link: &mut dyn TagRadio, tag: TagAddress, id: &str) -> Outcome {
     let bytes = link.read_record(tag, TIMEOUT)?;
     let record = cbor::decode(&bytes)?;
     ensure(record.object_id == *id, || format!("{record:?}"))?;
     Ok(format!("{} bytes, object \"{}\"", bytes.len(), record.object_id))
 }
 
-fn light(link: &mut BluezLink) -> Outcome {
+fn light(link: &mut dyn TagRadio) -> Outcome {
     let pattern = Pattern::new(Bits::FLICKER, Duration::from_millis(50))?;
     let begin = Instant::now();
     let on = link.command(CUP, LedCommand::Play(pattern), TIMEOUT)?;
@@ -97,14 +102,14 @@ fn light(link: &mut BluezLink) -> Outcome {
     ))
 }
 
-fn info(link: &mut BluezLink) -> Outcome {
+fn info(link: &mut dyn TagRadio) -> Outcome {
     let info = link.info(CUP, TIMEOUT)?;
     ensure(info.battery == Some(80) && info.has_record && !info.playing, || format!("{info:?}"))?;
     ensure(!info.firmware.is_empty(), || format!("{info:?}"))?;
     Ok(format!("{} {}, firmware {}", info.manufacturer, info.model, info.firmware))
 }
 
-fn new_record(link: &mut BluezLink) -> Outcome {
+fn new_record(link: &mut dyn TagRadio) -> Outcome {
     let old = link.read_record(CUP, TIMEOUT)?;
     let mut changed = cbor::decode(&old)?;
     changed.bounding_box.height += 0.01;
@@ -126,7 +131,7 @@ fn fault<T>(outcome: Result<T, DeviceError>) -> Result<String, Box<dyn Error>> {
     }
 }
 
-fn pair(link: &mut BluezLink, tag: TagAddress, passkey: Option<u32>, id: &str) -> Outcome {
+fn pair(link: &mut dyn TagRadio, tag: TagAddress, passkey: Option<u32>, id: &str) -> Outcome {
     let begin = Instant::now();
     link.pair(tag, passkey)?;
     let took = begin.elapsed().as_secs_f64() * 1e3;
@@ -137,14 +142,14 @@ fn pair(link: &mut BluezLink, tag: TagAddress, passkey: Option<u32>, id: &str) -
 }
 
 /// After a wrong passkey the old bond is gone as well, and the tag refuses what it guards.
-fn wrong(link: &mut BluezLink) -> Outcome {
+fn wrong(link: &mut dyn TagRadio) -> Outcome {
     let pairing = fault(link.pair(BOX, Some(PASSKEY + 1)).map(drop))?;
     let read = fault(link.read_record(BOX, TIMEOUT))?;
     let command = fault(link.command(BOX, LedCommand::Stop, TIMEOUT))?;
     Ok(format!("\"{pairing}\"; record: \"{read}\"; command: \"{command}\""))
 }
 
-fn nobody(link: &mut BluezLink) -> Outcome {
+fn nobody(link: &mut dyn TagRadio) -> Outcome {
     let limit = Duration::from_secs(3);
     let begin = Instant::now();
     let outcome = link.read_record(NOBODY, limit);

@@ -44,6 +44,8 @@ pub enum Scenario {
     Default,
     /// Something stands before the object "cup" (else before the last one); its LED stays in view.
     Occluded,
+    /// The object "cup" stands within the arm's reach.
+    Reach,
 }
 
 /// Camera model.

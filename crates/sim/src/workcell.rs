@@ -7,14 +7,15 @@ use std::path::Path;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use nalgebra::{Point3, Unit, UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, Point3, Rotation3, Unit, UnitQuaternion, Vector3};
 use rand::RngExt;
 use vergence_devices::{Clock, Config, Description, Head, Robot, Side};
 use vergence_geometry::{Camera as Lens, Chain, Solid, Transform};
+use vergence_imaging::Image;
 use vergence_link::HciLink;
 use vergence_tag::{Pattern, Record, pattern::Bits};
 
-use crate::camera::{Blinker, Sensor};
+use crate::camera::{Blinker, Capture, Sensor};
 use crate::config::{GeometryError, Scenario, SimConfig};
 use crate::devices::{SimCamera, SimClock, SimPanTilt};
 use crate::error::SimError;
@@ -22,8 +23,9 @@ use crate::lights::Play;
 use crate::noise::{normal, stream};
 use crate::placement::{RestView, compose};
 use crate::radio::{self, Radio};
+use crate::scene::{Body, Material};
 use crate::servo::Servo;
-use crate::trace::{self, Stage};
+use crate::trace::{self, Stage, Texture};
 use crate::world::{Shared, Shutter, TrueHead, World, lock};
 use crate::{EMBEDDED_CONFIG, EMBEDDED_URDF};
 
@@ -136,6 +138,7 @@ impl Workcell {
             heads: [left, right],
             objects: composition.objects,
             bodies_of: composition.bodies_of,
+            without_arm: composition.scene.bodies.len(),
             clutter: composition.clutter,
             radio,
             status,
@@ -219,6 +222,36 @@ impl Workcell {
         lock(&self.world).place_object(id, base_from_object)
     }
 
+    /// Shows the arm's parts where they are now, in place of where they were; the cameras see them
+    /// from the next picture on.
+    pub fn show_arm(&self, parts: &[ArmPart]) {
+        lock(&self.world).show_arm(parts.iter().map(|part| {
+            let surface = Material::matt(part.albedo, Texture::Plain, 1).glossy(0.03);
+            Body::new(rendered(&part.solid), &part.base_from_solid, surface)
+        }));
+    }
+
+    /// A photograph by an onlooker who stands at `eye` and looks at `target` (base, m): for people,
+    /// no part of the robot.
+    pub fn photograph(&self, eye: &Point3<f64>, target: &Point3<f64>, lens: Lens) -> Image<u8> {
+        let ahead = Unit::new_normalize(target - eye);
+        let right = ahead.cross(&Vector3::z()).normalize();
+        let axes = [right, ahead.cross(&right), ahead.into_inner()];
+        let turn = Rotation3::from_matrix_unchecked(Matrix3::from_columns(&axes));
+        let pose = Transform::from_parts(eye.coords.into(), turn.into());
+        let world = lock(&self.world);
+        let capture = Capture {
+            sequence: 0,
+            start: world.seconds(),
+            base_from_optical: [pose; 2],
+            blinkers: Vec::new(),
+            stage: world.stage.clone(),
+        };
+        drop(world);
+        Sensor::new(lens, self.settings.camera, &self.settings.light, self.seed, 0)
+            .picture(&capture)
+    }
+
     /// The wiring: what the robot knows of its cameras and joints.
     pub fn config(&self) -> &Config {
         &self.config
@@ -232,6 +265,35 @@ impl Workcell {
     /// The simulator's settings.
     pub fn settings(&self) -> &SimConfig {
         &self.settings
+    }
+}
+
+/// A part of the arm as cameras see it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ArmPart {
+    /// Where it is.
+    pub base_from_solid: Transform,
+    /// Its form.
+    pub solid: Solid,
+    /// Share of light that it gives back.
+    pub albedo: f32,
+}
+
+/// The rendered form of a solid; a hull is shown as the box around it.
+fn rendered(solid: &Solid) -> trace::Solid {
+    let round = |radius: f64, half: f64| trace::Solid::Frustum {
+        bottom: radius as f32,
+        top: radius as f32,
+        half: half as f32,
+    };
+    match solid {
+        Solid::Cuboid { half } => trace::Solid::Box([half.x, half.y, half.z].map(|h| h as f32)),
+        Solid::Cylinder { radius, half_height } => round(*radius, *half_height),
+        Solid::Sphere { radius } => trace::Solid::Sphere(*radius as f32),
+        Solid::Convex { vertices } => {
+            let reach = |k: usize| vertices.iter().map(|v| v[k].abs()).fold(0.0, f64::max);
+            trace::Solid::Box([0, 1, 2].map(|k| reach(k) as f32))
+        }
     }
 }
 

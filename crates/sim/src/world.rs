@@ -16,6 +16,7 @@ use crate::camera::{Blinker, Capture};
 use crate::config::SimConfig;
 use crate::placement::TaggedObject;
 use crate::radio::{self, Radio};
+use crate::scene::Body;
 use crate::servo::Servo;
 use crate::trace::{Solid, Stage};
 
@@ -72,6 +73,8 @@ pub struct World {
     pub(crate) objects: Vec<TaggedObject>,
     /// Which bodies of the scene belong to each object.
     pub(crate) bodies_of: Vec<Range<usize>>,
+    /// Number of bodies of the scene that are not the arm's; those come last.
+    pub(crate) without_arm: usize,
     /// Untagged things on the table.
     pub(crate) clutter: Vec<(Transform, Solid)>,
     pub(crate) radio: Radio,
@@ -143,6 +146,14 @@ impl World {
         }
         self.stage = Arc::new(Stage::new(scene));
         true
+    }
+
+    /// Shows an arm, in place of the one that was shown.
+    pub fn show_arm(&mut self, parts: impl Iterator<Item = Body>) {
+        let mut scene = self.stage.scene.clone();
+        scene.bodies.truncate(self.without_arm);
+        scene.bodies.extend(parts);
+        self.stage = Arc::new(Stage::new(scene));
     }
 
     fn move_servos(&mut self, time: f64) {

@@ -18,6 +18,7 @@
 //! Memory is a window of frames of constant length. The mathematics is that of `docs/landmark.md`.
 
 pub mod evidence;
+pub mod explain;
 pub mod front;
 pub mod history;
 pub mod motion;
@@ -225,6 +226,14 @@ fn families(requests: &[Request]) -> Vec<Vec<usize>> {
     families
 }
 
+/// Registers and filters a frame.
+fn past(reference: &mut Reference, frame: &Frame, time: f64, reuse: Option<Image<i16>>) -> Past {
+    let mut placement = reference.place(&frame.image);
+    placement.row_gain = nuisance::smoothed(&placement.row_gain);
+    let filtered = still(front::filter(&frame.image, reuse), &placement);
+    Past { time, exposure: frame.exposure.as_secs_f64(), placement, filtered }
+}
+
 /// The filtered frame, moved back to where the first frame lay.
 fn still(filtered: Image<i16>, placement: &Placement) -> Image<i16> {
     if placement.dx.hypot(placement.dy) < STILL_PX {
@@ -237,15 +246,12 @@ impl Finder for SequentialFinder {
     fn push(&mut self, frame: &Frame) -> Result<(), FinderError> {
         let time = self.sequence.accept(frame)?;
         self.size = (frame.image.width(), frame.image.height());
-        let mut placement = self.reference.place(&frame.image);
-        placement.row_gain = nuisance::smoothed(&placement.row_gain);
-        let filtered = still(front::filter(&frame.image, self.spare.take()), &placement);
+        let past = past(&mut self.reference, frame, time, self.spare.take());
         let pixels = self.size.0 * self.size.1;
         let window = self.config.window_frames;
         let variation = self.variation.get_or_insert_with(|| Variation::new(pixels, window));
-        variation.push(filtered.data());
-        let exposure = frame.exposure.as_secs_f64();
-        self.spare = self.history.push(Past { time, exposure, placement, filtered });
+        variation.push(past.filtered.data());
+        self.spare = self.history.push(past);
         self.frames += 1;
         if self.frames >= FIRST_FRAMES {
             let scan = self.frames >= self.next_scan;

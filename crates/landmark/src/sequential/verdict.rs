@@ -21,7 +21,7 @@ use super::nuisance::{Nuisance, dot};
 use super::places::{Place, Watch};
 use super::scan::{BlockNoise, MARGIN};
 use super::surroundings::intruders;
-use super::template::{Bank, rates, transitions};
+use super::template::{Bank, every_line, rates, transitions};
 use crate::{Decision, Request, Sighting};
 
 /// Changes of the light that must have been seen: one more than a passing thing and its shadow make.
@@ -30,6 +30,12 @@ const TRANSITIONS: f64 = 5.0;
 /// Share of the explained energy that may stay unexplained beyond the noise: what phase, saturation,
 /// shake and JPEG leave of a tag's light is below a twentieth, a foreign code leaves more than a tenth.
 const MISFIT: f64 = 0.1;
+
+/// Standard deviations of chance by which another code must fit better to be believed.
+const CHANCE: f64 = 4.0;
+
+/// Degrees of freedom from which what is left over tells the noise.
+const FREE: f64 = 10.0;
 
 /// Factor on the noise of the neighbourhood before anything counts as unexplained.
 const NOISE_SLACK: f64 = 1.5;
@@ -49,9 +55,12 @@ const FOREIGN: [f64; 6] = [1.0, 1.5, 2.0, 3.0, 4.0, 6.0];
 /// Systematic part of a position's standard deviation (px): a light is no perfect point.
 const FLOOR_PX: f64 = 0.02;
 
-/// Restless places to reckon with, for every pixel, where the picture shows none but the one in
-/// question: one in a hundred pictures of 640x480.
-const UNSEEN: f64 = 0.01 / (640.0 * 480.0);
+/// Restless places to reckon with where the picture shows none but the one in question: so many in so
+/// many pixels.
+const UNSEEN: (f64, f64) = (0.005, 640.0 * 480.0);
+
+/// Foreign codes to reckon with in a picture, however many places are restless.
+const MOST_FOREIGN: f64 = 4.0;
 
 /// Share of the presence threshold from which a pixel is looked at closer: the rest may be lost
 /// between pixels.
@@ -134,21 +143,42 @@ pub fn presence(size: (usize, usize), requests: usize, false_alarm: f64) -> f64 
     (cells * requests as f64 / false_alarm).ln()
 }
 
+/// Log likelihood ratio by which each of so many other explanations must be beaten.
+pub fn margin(others: usize, wrong_identity: f64) -> f64 {
+    (others.max(1) as f64 / wrong_identity).ln()
+}
+
 impl Round<'_> {
     /// Log likelihood ratio that presence needs.
     fn presence(&self) -> f64 {
         presence(self.size, self.requests.len(), self.config.false_alarm)
     }
 
-    /// Log likelihood ratio that presence needs over places that vary more than the noise around
-    /// explains: they are few, but nothing is known of how they vary. Places close by may be ghosts of
-    /// this one, and a light that is known already is not restless.
-    fn presence_if_restless(&self, place: Point2<f64>) -> f64 {
+    /// Whether a place passes if it is one of those that vary more than the noise around explains.
+    /// They are few, but nothing is known of how they vary: with a noise of their own, or as a light
+    /// that blinks some other code.
+    fn stands_if_restless(&self, request: usize, seen: &Seen) -> bool {
+        // Places close by may be ghosts of this one, and a light that is known already is no riddle.
         let far = |a: &Point2<f64>, b: &Point2<f64>| (a - b).norm() > GHOST.0;
-        let others = self.restless.iter().filter(|p| far(p, &place));
-        let unknown = others.filter(|p| self.known.iter().all(|k| far(p, k))).count();
-        let expected = unknown as f64 + UNSEEN * (self.size.0 * self.size.1) as f64;
-        (expected * self.requests.len() as f64 / self.config.false_alarm).ln()
+        let others = self.restless.iter().filter(|p| far(p, &seen.place));
+        let unknown = others.filter(|p| self.known.iter().all(|k| far(p, k))).count() as f64;
+        let requests = self.requests.len() as f64;
+        let area = (self.size.0 * self.size.1) as f64 / UNSEEN.1;
+        let chances = (unknown + UNSEEN.0 * area) * requests / self.config.false_alarm;
+        if seen.evidence.restless < chances.ln() {
+            return false;
+        }
+        // A code of random chips looks like this pattern at one of its phases by chance; what is
+        // projected out cannot speak against it.
+        let pattern = &self.requests[request].pattern;
+        let times = self.history.times();
+        let span = times.last().map_or(0.0, |l| l.0) - times.first().map_or(0.0, |f| f.0);
+        let frames = times.len() as f64;
+        let chips = (span / pattern.chip.as_secs_f64() + 1.0).min(frames);
+        let left = chips * seen.series.freedom / frames;
+        let phases = pattern.bits.len() as f64;
+        let foreign = unknown.clamp(UNSEEN.0, MOST_FOREIGN);
+        left >= (foreign * requests * phases / self.config.wrong_identity).log2()
     }
 
     /// Log likelihood ratio from which a pixel is looked at closer.
@@ -158,7 +188,7 @@ impl Round<'_> {
 
     /// Log likelihood ratio by which another explanation must be beaten.
     fn margin(&self, others: usize) -> f64 {
-        (others.max(1) as f64 / self.config.wrong_identity).ln()
+        margin(others, self.config.wrong_identity)
     }
 
     /// Frame count at which a place of this evidence is worth another look: evidence grows by its
@@ -388,11 +418,14 @@ impl Round<'_> {
     /// Presence, quality of the fit, margins.
     fn stands(&self, request: usize, seen: &Seen, banks: &mut Banks) -> bool {
         let (own, series) = (seen.evidence, &seen.series);
-        if own.log_ratio < self.presence() || own.restless < self.presence_if_restless(seen.place) {
+        if own.log_ratio < self.presence() || !self.stands_if_restless(request, seen) {
             return false;
         }
         let rest = unexplained(series, &own) - NOISE_SLACK * series.freedom * series.noise;
         if rest > MISFIT * own.correlation * own.correlation {
+            return false;
+        }
+        if self.is_another_code(request, seen) {
             return false;
         }
         let mut scratch = Vec::new();
@@ -414,6 +447,25 @@ impl Round<'_> {
         let limit = own.log_ratio - self.margin(bank.hypotheses.len());
         let foreign = weigh(series, bank, limit, &mut scratch);
         foreign.is_none_or(|evidence| evidence.log_ratio <= limit)
+    }
+
+    /// Whether some other code of the same length and chip would fit much better: any such code lies in
+    /// the span of the lines of its period.
+    fn is_another_code(&self, request: usize, seen: &Seen) -> bool {
+        let (own, series) = (&seen.evidence, &seen.series);
+        let pattern = &self.requests[request].pattern;
+        let lines = every_line(pattern, self.history.times(), |line| {
+            series.clear(self.nuisance, line);
+        });
+        let free = series.freedom - lines.len() as f64;
+        let any: f64 = lines.iter().map(|l| f64::from(dot(l, &series.values)).powi(2)).sum();
+        let explained = own.correlation * own.correlation;
+        // The noise is what even the freest code leaves, as far as that can be told.
+        let rest = (series.energy - any).max(0.0);
+        let noise = if free > FREE { rest / free } else { NOISE_SLACK * series.noise };
+        let chance = (lines.len() as f64 - 1.0).max(1.0);
+        let better = any - explained - chance * noise;
+        better > (MISFIT * explained).max(CHANCE * (2.0 * chance).sqrt() * noise)
     }
 
     fn sighting(&self, request: usize, seen: &Seen, pixel: Point2<f64>) -> Sighting {

@@ -4,6 +4,7 @@
 //! clock tolerance, the exposure). Out: JSON with one detection for every tag that is seen.
 
 mod bound;
+mod picture;
 mod report;
 mod request;
 
@@ -53,6 +54,9 @@ pub struct Args {
     /// Print one JSON document instead of text
     #[arg(long)]
     json: bool,
+    /// Write pictures of how each tag was found to this folder
+    #[arg(long, conflicts_with_all = ["episodes", "bound"])]
+    save: Option<PathBuf>,
     /// Write the JSON to this file (with --episodes: one file an episode in this folder)
     #[arg(long)]
     out: Option<PathBuf>,
@@ -75,7 +79,7 @@ pub fn run(args: Args) -> Result<bool, Failure> {
     let (Some(recording), Some(request)) = (&args.recording, &args.request) else {
         return Err(Failure::misuse("no recording given", "name a recording and --request FILE"));
     };
-    let report = look(recording, request, args.method)?;
+    let report = look(recording, request, args.method, args.save.as_deref())?;
     if let Some(out) = &args.out {
         write(out, &report.json())?;
     }
@@ -104,7 +108,8 @@ fn run_set(set: &Path, out: &Path, method: Method) -> Result<bool, Failure> {
         Failure::failed(format!("{}: {e}", out.display()), "name a folder that can be written")
     })?;
     for episode in episodes {
-        let report = look(&episode.join("recording.mcap"), &episode.join("request.json"), method)?;
+        let (recording, request) = (episode.join("recording.mcap"), episode.join("request.json"));
+        let report = look(&recording, &request, method, None)?;
         let name = episode.file_name().unwrap_or_default().to_string_lossy().into_owned();
         eprintln!("{name}: {}", report.line());
         write(&out.join(name).with_extension("json"), &report.json())?;
@@ -118,8 +123,13 @@ fn write(path: &Path, text: &str) -> Result<(), Failure> {
     })
 }
 
-/// Looks through one recording.
-fn look(recording: &Path, request: &Path, method: Method) -> Result<Report, Failure> {
+/// Looks through one recording; pictures of what is found go to `save`.
+fn look(
+    recording: &Path,
+    request: &Path,
+    method: Method,
+    save: Option<&Path>,
+) -> Result<Report, Failure> {
     let request = BlinkRequest::read(request)?;
     let mut finder: Box<dyn Finder> = match method {
         Method::Paper => {
@@ -133,7 +143,7 @@ fn look(recording: &Path, request: &Path, method: Method) -> Result<Report, Fail
         }
     };
     let started = Instant::now();
-    let (mut frames, mut first) = (0, None);
+    let (mut frames, mut first, mut kept) = (0, None, Vec::new());
     let unreadable = |e: RecordingError| {
         Failure::misuse(e, "name a ROS 2 recording (MCAP) and, as `camera`, its image topic")
     };
@@ -144,6 +154,9 @@ fn look(recording: &Path, request: &Path, method: Method) -> Result<Report, Fail
         first.get_or_insert(frame.stamp);
         finder.push(&frame).map_err(|e| refused(&e))?;
         frames += 1;
+        if save.is_some() {
+            kept.push(frame);
+        }
     }
     finder.finish();
     let Some(first) = first else {
@@ -151,6 +164,9 @@ fn look(recording: &Path, request: &Path, method: Method) -> Result<Report, Fail
         return Err(Failure::misuse(message, "name the image topic as `camera` in the request"));
     };
     let seconds = started.elapsed().as_secs_f64();
+    if let Some(dir) = save {
+        picture::save(dir, &kept, &request.requests()?, finder.decisions())?;
+    }
     Ok(Report::new(&request, finder.decisions(), first, frames, seconds))
 }
 
