@@ -25,6 +25,48 @@ const SOFTNESS: f64 = 0.05;
 /// Points of the grid.
 const GRID: usize = 400;
 
+/// The error of an encoder that rounds, plus normal noise: its log likelihood and what follows from it.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Rounding {
+    half: f64,
+    sigma: f64,
+}
+
+impl Rounding {
+    /// Rounding with this standard deviation, and noise (both in the error's unit). Noise is taken no
+    /// smaller than encoders are uneven.
+    pub(crate) fn new(step_sigma: f64, noise: f64) -> Self {
+        let half = step_sigma * 3f64.sqrt();
+        Rounding { half, sigma: noise.hypot(SOFTNESS * half).max(1e-9) }
+    }
+
+    /// Twice the negative log likelihood, as chi-squared counts, least for no error; and half its
+    /// derivative.
+    pub(crate) fn cost(&self, error: f64) -> (f64, f64) {
+        let Rounding { half, sigma } = *self;
+        let density = |x: f64| (-0.5 * x * x).exp() / (sigma * std::f64::consts::TAU.sqrt());
+        let value = likelihood(error, half, sigma);
+        let slope = density((half + error) / sigma) - density((half - error) / sigma);
+        let least = likelihood(0.0, half, sigma);
+        (-2.0 * (value / least).ln(), -(1.0 - STRAY) * slope / value)
+    }
+
+    /// Fisher's information: what one reading tells of the error's centre, one over its variance.
+    pub(crate) fn information(&self) -> f64 {
+        const POINTS: usize = 200;
+        let reach = self.half + 5.0 * self.sigma;
+        let step = 2.0 * reach / POINTS as f64;
+        let (mut told, mut total) = (0.0, 0.0);
+        for i in 0..POINTS {
+            let error = -reach + step * (i as f64 + 0.5);
+            let weight = likelihood(error, self.half, self.sigma);
+            told += weight * self.cost(error).1.powi(2);
+            total += weight;
+        }
+        told / total
+    }
+}
+
 /// One fixation that stands for all; `None` when the light is behind the camera. `step_sigma` is the
 /// standard deviation of the encoder's rounding (rad).
 pub(crate) fn combine(
@@ -33,7 +75,6 @@ pub(crate) fn combine(
     step_sigma: f64,
     near: &Point3<f64>,
 ) -> Option<Fixation> {
-    let half = step_sigma * 3f64.sqrt();
     let mut offsets: [Vec<f64>; 2] = [Vec::new(), Vec::new()];
     let mut noise = [0.0; 2];
     for fixation in fixations {
@@ -46,10 +87,8 @@ pub(crate) fn combine(
             noise[joint] += variance[(joint, joint)] / fixations.len() as f64;
         }
     }
-    let found = [0, 1].map(|joint| {
-        let sigma = noise[joint].sqrt().hypot(SOFTNESS * half).max(1e-9);
-        common(&offsets[joint], half, sigma)
-    });
+    let found = [0, 1]
+        .map(|joint| common(&offsets[joint], &Rounding::new(step_sigma, noise[joint].sqrt())));
     // At the middle of the angles the common error is known best.
     let mean = |joint: usize| {
         fixations.iter().map(|f| f.angles[joint]).sum::<f64>() / fixations.len() as f64
@@ -65,8 +104,9 @@ pub(crate) fn combine(
     })
 }
 
-/// Mean and variance of what all offsets have in common, each off by up to `half` and by normal noise.
-fn common(offsets: &[f64], half: f64, sigma: f64) -> (f64, f64) {
+/// Mean and variance of what all offsets have in common.
+fn common(offsets: &[f64], rounding: &Rounding) -> (f64, f64) {
+    let Rounding { half, sigma } = *rounding;
     let mean = offsets.iter().sum::<f64>() / offsets.len().max(1) as f64;
     let reach = half + 4.0 * sigma;
     let step = 2.0 * reach / (GRID - 1) as f64;
@@ -107,6 +147,33 @@ mod tests {
     use rand::{RngExt, SeedableRng};
     use rand_pcg::Pcg64Mcg;
 
+    /// Rounding to within one.
+    fn unit(noise: f64) -> Rounding {
+        Rounding::new(1.0 / 3f64.sqrt(), noise)
+    }
+
+    #[test]
+    fn the_cost_falls_off_as_its_derivative_says_and_tells_what_it_tells() {
+        for noise in [0.05, 0.4, 3.0] {
+            let rounding = unit(noise);
+            for error in [-1.2, -0.95, -0.3, 0.0, 0.5, 1.05] {
+                let at = |h: f64| rounding.cost(error + h).0;
+                let numeric = 0.5 * (at(1e-5) - at(-1e-5)) / 2e-5;
+                let (_, analytic) = rounding.cost(error);
+                let off = (numeric - analytic).abs();
+                assert!(
+                    off < 0.02 * (1.0 + analytic.abs()),
+                    "{noise} {error}: {numeric} {analytic}"
+                );
+            }
+        }
+        // Much noise: a normal error again, the variances added.
+        let wide = unit(3.0).information() * (9.0 + 1.0 / 3.0);
+        assert!((wide - 1.0).abs() < 0.05, "{wide}");
+        // Little noise: more than the variance of the rounding tells.
+        assert!(unit(0.05).information() > 3.0 * 3.0);
+    }
+
     /// Errors of the common offset by this method and by the mean, and by how many of its own sigmas.
     fn trial(count: usize, seed: u64) -> (f64, f64, f64) {
         let mut random = Pcg64Mcg::seed_from_u64(seed);
@@ -115,7 +182,7 @@ mod tests {
         let noise: Vec<f64> = (0..count).map(|_| normal(sigma)).collect();
         let offsets: Vec<f64> =
             noise.into_iter().map(|n| 0.3 + n + random.random_range(-half..half)).collect();
-        let (found, variance) = common(&offsets, half, sigma);
+        let (found, variance) = common(&offsets, &unit(sigma));
         let mean = offsets.iter().sum::<f64>() / count as f64;
         (found - 0.3, mean - 0.3, (found - 0.3) / variance.sqrt())
     }
@@ -140,9 +207,9 @@ mod tests {
     #[test]
     fn a_stray_reading_does_no_harm() {
         let mut offsets: Vec<f64> = (0..16).map(|i| 0.1 * f64::from(i) - 0.75).collect();
-        let (clean, _) = common(&offsets, 1.0, 0.1);
+        let (clean, _) = common(&offsets, &unit(0.1));
         offsets.push(3.0);
-        let (found, _) = common(&offsets, 1.0, 0.1);
+        let (found, _) = common(&offsets, &unit(0.1));
         assert!((found - clean).abs() < 0.25, "{found} instead of {clean}");
     }
 }
