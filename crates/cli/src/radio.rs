@@ -9,9 +9,11 @@ use vergence_devices::config::RadioConfig;
 use vergence_devices::{Clock, Config};
 use vergence_link::{BOND_BYTES, Bond, HciLink, LinkConfig, TagRadio};
 use vergence_sim::Workcell;
+use vergence_tag::signature::TrustedKeys;
 
 use crate::drivers::BLUEZ;
 use crate::failure::Failure;
+use crate::signing;
 
 /// An opened radio.
 pub struct Radio {
@@ -19,6 +21,8 @@ pub struct Radio {
     pub link: Box<dyn TagRadio>,
     /// The time that it runs on.
     pub clock: Box<dyn Clock>,
+    /// Whose signatures on records count.
+    pub trusted: TrustedKeys,
     /// Where its bonds are kept.
     bonds: Option<PathBuf>,
 }
@@ -30,8 +34,9 @@ pub fn open(config: &Config, folder: &Path) -> Result<Radio, Failure> {
         BLUEZ => bluez(radio.adapter.as_deref())?,
         _ => Box::new(hci(radio)?),
     };
+    let trusted = signing::trusted(config, folder)?;
     let bonds = radio.bonds.as_ref().map(|file| folder.join(file));
-    let mut radio = Radio { link, clock: Box::new(SystemClock::start()), bonds };
+    let mut radio = Radio { link, clock: Box::new(SystemClock::start()), trusted, bonds };
     radio.load()?;
     Ok(radio)
 }
@@ -69,8 +74,8 @@ fn bluez(_: Option<&str>) -> Result<Box<dyn TagRadio>, Failure> {
 
 impl Radio {
     /// The radio of a simulated workcell, whose tags and bonds live as long as the program.
-    pub fn simulated(workcell: &Workcell) -> Self {
-        Radio { link: Box::new(workcell.radio()), clock: workcell.clock(), bonds: None }
+    pub fn simulated(workcell: &Workcell, trusted: TrustedKeys) -> Self {
+        Radio { link: Box::new(workcell.radio()), clock: workcell.clock(), trusted, bonds: None }
     }
 
     /// Takes up the bonds of earlier runs.

@@ -9,11 +9,13 @@ use vergence::report::{PhysicsReport, Report, TruthReport, numbers};
 use vergence_devices::{Config, Description, Robot};
 use vergence_geometry::Transform;
 use vergence_sim::{Scenario, SimConfig, Workcell};
+use vergence_tag::signature::TrustedKeys;
 
 use crate::bench::{self, SharedBench};
 use crate::drivers::{self, BLUEZ, HCI, SIM};
 use crate::failure::Failure;
 use crate::radio::{self, Radio};
+use crate::signing;
 
 /// Key of `[sim]` for [`built`].
 pub const BUILT: &str = "built";
@@ -58,16 +60,19 @@ impl RobotArgs {
             Some(path) => {
                 let (config, description) = read(path)?;
                 check_drivers(&config)?;
+                let signers = signing::required(&config, folder(path))?;
                 if !drivers::simulated(&config)? {
                     let devices = drivers::open(&config, &description, folder(path))?;
-                    return Opened::wired(config, description, devices);
+                    let opened = Opened::wired(config, description, devices)?;
+                    return Ok(opened.signed_by(signers));
                 }
                 let workcell = self.workcell(path, &config, &description)?;
                 let mut devices = workcell.robot();
                 if config.radio.driver != SIM {
                     devices.radio = radio::open(&config, folder(path))?.link;
                 }
-                Opened::new(workcell, devices, config, description)
+                let opened = Opened::new(workcell, devices, config, description)?;
+                Ok(opened.signed_by(signers))
             }
             None => Opened::embedded(self.seed, Scenario::Default),
         }
@@ -91,18 +96,21 @@ impl RobotArgs {
 
     /// Opens the tag radio alone.
     pub fn open_radio(&self) -> Result<Radio, Failure> {
-        let workcell = match &self.config {
+        let (workcell, trusted) = match &self.config {
             Some(path) => {
                 let (config, description) = read(path)?;
                 check_drivers(&config)?;
                 if config.radio.driver != SIM {
                     return radio::open(&config, folder(path));
                 }
-                self.workcell(path, &config, &description)?
+                let trusted = signing::trusted(&config, folder(path))?;
+                (self.workcell(path, &config, &description)?, trusted)
             }
-            None => Workcell::embedded(self.seed).map_err(unusable)?,
+            None => {
+                (Workcell::embedded(self.seed).map_err(unusable)?, TrustedKeys::default())
+            }
         };
-        Ok(Radio::simulated(&workcell))
+        Ok(Radio::simulated(&workcell, trusted))
     }
 
     /// The simulated workcell of a configuration. A calibrated configuration names the one from which
@@ -155,11 +163,12 @@ impl Opened {
         self.workcell.clone()
     }
 
-    /// Gives the robot its arm, when it has one: contacts are simulated around one object.
-    pub fn attach_arm(&mut self, object: &str) -> Result<(), Failure> {
+    /// Gives the robot its arm, when it has one: contacts are simulated around one object. With
+    /// `photographs` the stages are kept for [`Opened::save_grasp`].
+    pub fn attach_arm(&mut self, object: &str, photographs: bool) -> Result<(), Failure> {
         let (Some(workcell), Some(_)) = (&self.workcell, &self.config.arm) else { return Ok(()) };
-        let clock = workcell.robot().clock;
-        if let Some((arm, bench)) = bench::build(workcell, &self.description, object, clock)? {
+        let built = bench::build(workcell, &self.description, object, photographs)?;
+        if let Some((arm, bench)) = built {
             self.system.robot.arm = Some(Box::new(arm));
             self.system.hand = Some(bench::hand(&self.description)?);
             self.bench = Some(bench);
@@ -167,9 +176,21 @@ impl Opened {
         Ok(())
     }
 
+    /// Writes the grasp as an onlooker saw it (`stages.png`) and for a second physics engine
+    /// (`replay.json`), in simulation.
+    pub fn save_grasp(&self, dir: &Path) -> Result<(), Failure> {
+        self.bench.as_ref().map_or(Ok(()), |bench| bench::lock(bench).save(dir))
+    }
+
     /// The physics' verdict on what the arm did, in simulation.
     pub fn physics(&self) -> Option<PhysicsReport> {
         self.bench.as_ref().map(|bench| bench::lock(bench).verdict())
+    }
+
+    /// The same, for records that one of these keys signed.
+    fn signed_by(mut self, signers: Option<TrustedKeys>) -> Self {
+        self.system.required_signers = signers;
+        self
     }
 
     /// The simulator's truth of an object.

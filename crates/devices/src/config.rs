@@ -181,6 +181,13 @@ pub struct RadioConfig {
     /// folder. It is secret: whoever has it commands the tags.
     #[serde(default)]
     pub bonds: Option<PathBuf>,
+    /// Public keys (PEM) whose signatures on records the robot trusts, relative to the
+    /// configuration's folder.
+    #[serde(default)]
+    pub trusted_keys: Vec<PathBuf>,
+    /// Refuse to find objects whose records are not signed by one of them.
+    #[serde(default)]
+    pub require_signature: bool,
 }
 
 impl Config {
