@@ -50,14 +50,14 @@ cat >/etc/dbus.conf <<CONF
 CONF
 dbus-daemon --config-file=/etc/dbus.conf --nopidfile --fork
 btattach -B /dev/ttyS1 -P h4 >/dev/null 2>&1 &
-bluetoothd -n >/tmp/bluetoothd.log 2>&1 &
+bluetoothd -n >/run/bluetoothd.log 2>&1 &
 for second in 1 2 3 4 5 6 7 8 9 10; do
   [ -e /sys/class/bluetooth/hci0 ] && break
   sleep 1
 done
 sleep 2
 echo "# BlueZ $(bluetoothd --version)"
-if timeout 160 bluez_probe bluez; then result=passed; else result=failed; cat /tmp/bluetoothd.log; fi
+if timeout 160 bluez_probe bluez; then result=passed; else result=failed; cat /run/bluetoothd.log; fi
 kill $(pidof bluetoothd)
 sleep 1
 btmgmt --index 0 power off >/dev/null 2>&1 </dev/null
