@@ -5,25 +5,32 @@
 //! are fixed. After every motion the object and the arm's links are put into the workcell where the
 //! physics has them, so that the cameras see them there and what they hide is hidden.
 
+use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
+use nalgebra::{Point3, Vector3};
 use vergence::Hand;
 use vergence::report::PhysicsReport;
 use vergence_devices::{
-    Arm, ArmReading, Clock, Description, DeviceError, Execution, GripCommand, GripperReading,
-    MotionLimits,
+    Arm, ArmReading, Description, DeviceError, Execution, GripCommand, GripperReading, MotionLimits,
 };
-use vergence_geometry::{Body, Trajectory, Transform};
+use vergence_geometry::{Body, Camera, Trajectory, Transform};
 use vergence_grasp::{Config, Obstacle, gripper, object};
+use vergence_imaging::canvas::{Canvas, colour};
+use vergence_imaging::{Image, codec};
 use vergence_physics::experiment::{Cell, HOME, table};
+use vergence_physics::recording::{self, Motion};
 use vergence_physics::{PhysicsArm, SharedWorld, Touch, TrueObject};
 use vergence_sim::{ArmPart, Workcell};
 
 use crate::failure::Failure;
+use crate::save::cannot_write;
 
 /// Contact before the fingers close above which the arm has run into something (N).
 const BUMP: f64 = 0.5;
+/// Size of a photograph (px).
+const PHOTOGRAPH: [usize; 2] = [320, 320];
 /// Height that the object must rise to count as lifted (mm): most of the planned lift of 100 mm.
 const LIFTED_MM: f64 = 80.0;
 
@@ -35,6 +42,12 @@ pub struct Bench {
     grips: usize,
     collision: Option<Touch>,
     closing_error_mm: Option<f64>,
+    /// What stood where before the first motion, and the motions since: for a second opinion.
+    object: TrueObject,
+    obstacles: Vec<Obstacle>,
+    motions: Vec<Motion>,
+    /// Photographs of the stages, when they are wanted.
+    photographs: Option<Vec<Image<u8>>>,
 }
 
 impl Bench {
@@ -49,6 +62,29 @@ impl Bench {
             let touch = world.take_touch().filter(|touch| touch.force >= BUMP);
             self.collision = self.collision.take().or(touch);
         }
+    }
+
+    /// Writes the motions for `scripts/replay_mujoco.py` and the photographs side by side.
+    pub fn save(&self, dir: &Path) -> Result<(), Failure> {
+        let replay =
+            recording::of_motions(&HOME, &self.object, &self.obstacles, &self.motions).to_string();
+        let path = dir.join("replay.json");
+        std::fs::write(&path, replay).map_err(|error| cannot_write(&path, error))?;
+        let Some(strip) = self.strip() else { return Ok(()) };
+        let path = dir.join("stages.png");
+        codec::write_canvas(&path, &strip).map_err(|error| cannot_write(&path, error))
+    }
+
+    /// The stages so far as an onlooker sees them, from left to right; `None` when none was taken.
+    fn strip(&self) -> Option<Canvas> {
+        let photographs = self.photographs.as_ref()?;
+        let first = photographs.first()?;
+        let mut strip =
+            Canvas::new(first.width() * photographs.len(), first.height(), colour::WHITE);
+        for (k, photograph) in photographs.iter().enumerate() {
+            strip.blit_gray(photograph, k * first.width(), 0, 1);
+        }
+        Some(strip)
     }
 
     /// What really happened.
@@ -90,7 +126,7 @@ pub fn build(
     workcell: &Arc<Workcell>,
     description: &Description,
     object: &str,
-    clock: Box<dyn Clock>,
+    photographs: bool,
 ) -> Result<Option<(SimArm, SharedBench)>, Failure> {
     let truth = workcell.truth();
     let Some(wanted) = truth.objects.iter().find(|o| o.id == object) else { return Ok(None) };
@@ -129,7 +165,7 @@ pub fn build(
             "compare with the workcell that is built in: `vergence workcell DIR`",
         )
     };
-    let path = std::path::Path::new("workcell.urdf");
+    let path = Path::new("workcell.urdf");
     let cell = Cell::parse(&description.text, path).map_err(|e| unusable(&e))?;
     let world = cell.world(&HOME, &obstacles, &loose).map_err(|e| unusable(&e))?;
     let world: SharedWorld = Arc::new(Mutex::new(world));
@@ -139,12 +175,17 @@ pub fn build(
         grips: 0,
         collision: None,
         closing_error_mm: None,
+        object: loose,
+        obstacles,
+        motions: Vec::new(),
+        photographs: photographs.then(Vec::new),
     }));
     let links = links(description, &cell);
-    let arm = PhysicsArm::new(world, Some(Arc::from(clock)));
+    let arm = PhysicsArm::new(world, Some(Arc::from(workcell.clock())));
     let (workcell, object) = (workcell.clone(), object.into());
     let arm = SimArm { arm, bench: bench.clone(), workcell, object, links };
     arm.show();
+    arm.photograph();
     Ok(Some((arm, bench)))
 }
 
@@ -175,6 +216,16 @@ fn albedo(description: &Description, link: &str) -> f32 {
 }
 
 impl SimArm {
+    /// Keeps a photograph of the object from the side that the arm does not come from.
+    fn photograph(&self) {
+        let mut bench = lock(&self.bench);
+        let target = Point3::from(bench.start.translation.vector + Vector3::new(0.0, 0.0, 0.05));
+        let Some(photographs) = &mut bench.photographs else { return };
+        let eye = target + Vector3::new(-0.35, 0.5, 0.25);
+        let lens = Camera::centred(PHOTOGRAPH[0], PHOTOGRAPH[1], 380.0);
+        photographs.push(self.workcell.photograph(&eye, &target, lens));
+    }
+
     fn show(&self) {
         let pose = lock(&self.bench).pose();
         self.workcell.place_object(&self.object, &pose);
@@ -219,7 +270,16 @@ impl Arm for SimArm {
         limits: &MotionLimits,
     ) -> Result<Execution, DeviceError> {
         let outcome = self.arm.execute(trajectory, limits);
+        let mut bench = lock(&self.bench);
+        bench.motions.push(Motion::Move(trajectory.clone()));
+        let moves = bench.motions.iter().filter(|m| matches!(m, Motion::Move(_))).count();
+        let grips = bench.grips;
+        drop(bench);
         self.show();
+        // At the pre-grasp, and with the object lifted.
+        if (moves, grips) == (1, 1) || grips == 2 {
+            self.photograph();
+        }
         outcome
     }
 
@@ -231,6 +291,8 @@ impl Arm for SimArm {
         let mut bench = lock(&self.bench);
         bench.note_contacts();
         bench.grips += 1;
+        bench.motions.push(Motion::Grip(command));
+        let closing = bench.grips == 2;
         let before = bench.pose();
         drop(bench);
         let outcome = self.arm.grip(command, timeout);
@@ -241,6 +303,9 @@ impl Arm for SimArm {
         }
         drop(bench);
         self.show();
+        if closing {
+            self.photograph();
+        }
         outcome
     }
 

@@ -12,7 +12,7 @@ use vergence_sim::{Scenario, SimConfig, Workcell};
 use vergence_tag::signature::TrustedKeys;
 
 use crate::bench::{self, SharedBench};
-use crate::drivers::{self, HCI, SIM};
+use crate::drivers::{self, BLUEZ, HCI, SIM};
 use crate::failure::Failure;
 use crate::radio::{self, Radio};
 use crate::signing;
@@ -68,8 +68,8 @@ impl RobotArgs {
                 }
                 let workcell = self.workcell(path, &config, &description)?;
                 let mut devices = workcell.robot();
-                if config.radio.driver == HCI {
-                    devices.radio = Box::new(radio::open(&config, folder(path))?.link);
+                if config.radio.driver != SIM {
+                    devices.radio = radio::open(&config, folder(path))?.link;
                 }
                 let opened = Opened::new(workcell, devices, config, description)?;
                 Ok(opened.signed_by(signers))
@@ -100,7 +100,7 @@ impl RobotArgs {
             Some(path) => {
                 let (config, description) = read(path)?;
                 check_drivers(&config)?;
-                if config.radio.driver == HCI {
+                if config.radio.driver != SIM {
                     return radio::open(&config, folder(path));
                 }
                 let trusted = signing::trusted(&config, folder(path))?;
@@ -163,16 +163,23 @@ impl Opened {
         self.workcell.clone()
     }
 
-    /// Gives the robot its arm, when it has one: contacts are simulated around one object.
-    pub fn attach_arm(&mut self, object: &str) -> Result<(), Failure> {
+    /// Gives the robot its arm, when it has one: contacts are simulated around one object. With
+    /// `photographs` the stages are kept for [`Opened::save_grasp`].
+    pub fn attach_arm(&mut self, object: &str, photographs: bool) -> Result<(), Failure> {
         let (Some(workcell), Some(_)) = (&self.workcell, &self.config.arm) else { return Ok(()) };
-        let clock = workcell.robot().clock;
-        if let Some((arm, bench)) = bench::build(workcell, &self.description, object, clock)? {
+        let built = bench::build(workcell, &self.description, object, photographs)?;
+        if let Some((arm, bench)) = built {
             self.system.robot.arm = Some(Box::new(arm));
             self.system.hand = Some(bench::hand(&self.description)?);
             self.bench = Some(bench);
         }
         Ok(())
+    }
+
+    /// Writes the grasp as an onlooker saw it (`stages.png`) and for a second physics engine
+    /// (`replay.json`), in simulation.
+    pub fn save_grasp(&self, dir: &Path) -> Result<(), Failure> {
+        self.bench.as_ref().map_or(Ok(()), |bench| bench::lock(bench).save(dir))
     }
 
     /// The physics' verdict on what the arm did, in simulation.
@@ -243,8 +250,8 @@ fn built(path: &Path, config: &Config) -> Result<Option<PathBuf>, Failure> {
 /// Refuses drivers of radio and arm that do not exist.
 fn check_drivers(config: &Config) -> Result<(), Failure> {
     match config.radio.driver.as_str() {
-        SIM | HCI => {}
-        other => return Err(drivers::unknown("radio", other, HCI)),
+        SIM | HCI | BLUEZ => {}
+        other => return Err(drivers::unknown("radio", other, "hci, bluez")),
     }
     match &config.arm {
         Some(arm) if arm.driver != SIM => Err(drivers::unknown("arm", &arm.driver, "no other")),

@@ -9,7 +9,6 @@
 
 use std::error::Error;
 
-use vergence_air::StreamTransport;
 use vergence_link::{BluezLink, HciLink, LinkConfig, TagRadio};
 
 #[path = "../tests/support/conformance.rs"]
@@ -18,9 +17,7 @@ mod conformance;
 fn main() -> Result<(), Box<dyn Error>> {
     let mut link: Box<dyn TagRadio> = match std::env::args().nth(1).as_deref() {
         Some("bluez") => Box::new(BluezLink::open(None)?),
-        Some("hci0") => {
-            Box::new(HciLink::open(|| StreamTransport::user_channel(0), LinkConfig::default())?)
-        }
+        Some("hci0") => Box::new(HciLink::linux(0, LinkConfig::default())?),
         _ => return Err("bluez_probe bluez|hci0".into()),
     };
     let failed = conformance::conform(&mut *link);

@@ -7,14 +7,15 @@ use std::path::Path;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use nalgebra::{Point3, Unit, UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, Point3, Rotation3, Unit, UnitQuaternion, Vector3};
 use rand::RngExt;
 use vergence_devices::{Clock, Config, Description, Head, Robot, Side};
 use vergence_geometry::{Camera as Lens, Chain, Solid, Transform};
+use vergence_imaging::Image;
 use vergence_link::HciLink;
 use vergence_tag::{Pattern, Record, pattern::Bits};
 
-use crate::camera::{Blinker, Sensor};
+use crate::camera::{Blinker, Capture, Sensor};
 use crate::config::{GeometryError, Scenario, SimConfig};
 use crate::devices::{SimCamera, SimClock, SimPanTilt};
 use crate::error::SimError;
@@ -228,6 +229,27 @@ impl Workcell {
             let surface = Material::matt(part.albedo, Texture::Plain, 1).glossy(0.03);
             Body::new(rendered(&part.solid), &part.base_from_solid, surface)
         }));
+    }
+
+    /// A photograph by an onlooker who stands at `eye` and looks at `target` (base, m): for people,
+    /// no part of the robot.
+    pub fn photograph(&self, eye: &Point3<f64>, target: &Point3<f64>, lens: Lens) -> Image<u8> {
+        let ahead = Unit::new_normalize(target - eye);
+        let right = ahead.cross(&Vector3::z()).normalize();
+        let axes = [right, ahead.cross(&right), ahead.into_inner()];
+        let turn = Rotation3::from_matrix_unchecked(Matrix3::from_columns(&axes));
+        let pose = Transform::from_parts(eye.coords.into(), turn.into());
+        let world = lock(&self.world);
+        let capture = Capture {
+            sequence: 0,
+            start: world.seconds(),
+            base_from_optical: [pose; 2],
+            blinkers: Vec::new(),
+            stage: world.stage.clone(),
+        };
+        drop(world);
+        Sensor::new(lens, self.settings.camera, &self.settings.light, self.seed, 0)
+            .picture(&capture)
     }
 
     /// The wiring: what the robot knows of its cameras and joints.

@@ -137,6 +137,7 @@ impl Attempt<'_, '_> {
         self.describe(&planned);
         self.step("transfer", |a| a.transfer(&planned))?;
         let again = self.step("look again", Self::look_again)?;
+        self.run.observer.notice(&Event::Stage("pregrasp"));
         let corrected = self.step("correct", |a| a.correct(&hand, &planned, &again))?;
         self.describe(&corrected);
         self.report.corrected_by_mm = Some(shift_mm(&planned, &corrected));
@@ -145,6 +146,7 @@ impl Attempt<'_, '_> {
             a.play("approach", &corrected.approach, &a.config.limits.clone())
         })?;
         self.step("close", |a| a.close(&corrected))?;
+        self.picture("closed")?;
         self.step("lift", |a| a.lift(&corrected))?;
         self.step("verify", |a| a.verify(&hand, &corrected, &again))
     }
@@ -158,6 +160,13 @@ impl Attempt<'_, '_> {
         let outcome = work(self);
         self.run.end(name, start);
         outcome
+    }
+
+    /// Takes a picture of a stage.
+    fn picture(&mut self, stage: &'static str) -> Result<(), Failure> {
+        self.run.look()?;
+        self.run.observer.notice(&Event::Stage(stage));
+        Ok(())
     }
 
     fn describe(&mut self, plan: &Plan) {
@@ -232,6 +241,7 @@ impl Attempt<'_, '_> {
             covariance: before.landmark.covariance,
         };
         let after = self.run.measure(before.tag, &expected.position)?;
+        self.picture("lifted")?;
         let verdict = verify_lift(&before.landmark, &after, &motion);
         self.report.verified = Some(verdict == LiftVerdict::Held);
         match verdict {
@@ -247,7 +257,9 @@ impl Attempt<'_, '_> {
     }
 
     fn grip(&mut self, width: f64, force: f64) -> Result<GripperReading, Failure> {
-        Ok(self.arm()?.grip(GripCommand { width, force }, FINGERS)?)
+        let reading = self.arm()?.grip(GripCommand { width, force }, FINGERS)?;
+        self.run.observer.notice(&Event::Gripped(&reading));
+        Ok(reading)
     }
 
     /// Plays a motion to its end; anything else is a failure that says what happened.
@@ -259,7 +271,10 @@ impl Attempt<'_, '_> {
     ) -> Result<(), Failure> {
         let (start, names) = (self.run.system.robot.clock.now(), self.arm()?.joint_names());
         self.run.observer.notice(&Event::Motion { start, names: &names, trajectory });
-        let what = match self.arm()?.execute(trajectory, limits)? {
+        let outcome = self.arm()?.execute(trajectory, limits)?;
+        let end = self.run.system.robot.clock.now();
+        self.run.observer.notice(&Event::Moved { start, end, names: &names, trajectory });
+        let what = match outcome {
             Execution::Reached => return Ok(()),
             Execution::Stopped => "stopped on command".into(),
             Execution::Contact { link, force } => {

@@ -28,7 +28,7 @@ pub struct Grasp {
 /// Runs the command.
 pub fn run(args: &Grasp) -> Result<bool, Failure> {
     let mut robot = args.robot.open()?;
-    robot.attach_arm(&args.object)?;
+    robot.attach_arm(&args.object, args.save.is_some())?;
     let find = FindConfig { seed: args.robot.seed, ..FindConfig::default() };
     let config = GraspConfig { find, ..GraspConfig::default() };
     let saver = args.save.as_deref().map(|dir| Saver::create(dir, &robot)).transpose()?;
@@ -41,7 +41,8 @@ pub fn run(args: &Grasp) -> Result<bool, Failure> {
     }
     let (progress, saver) = observer;
     drop(progress);
-    if let Some(saver) = saver {
+    if let (Some(saver), Some(dir)) = (saver, &args.save) {
+        robot.save_grasp(dir)?;
         saver.finish(&report)?;
     }
     match args.json {

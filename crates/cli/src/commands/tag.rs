@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use clap::{Args, Subcommand};
 use serde::Serialize;
-use vergence_devices::{DeviceError, TagAddress, TagLink};
+use vergence_devices::{DeviceError, TagAddress};
 use vergence_tag::{Pattern, Record, cbor, pattern::Bits};
 
 use crate::failure::Failure;
@@ -231,7 +231,7 @@ fn bond(radio: &mut Radio, tag: TagAddress, passkey: Option<u32>) -> Result<bool
     let bond = radio.link.pair(tag, passkey).map_err(|error| {
         Failure::failed(error, "compare the passkey with the one printed on the tag; after a wrong one the tag makes every robot wait")
     })?;
-    bond.map_or(Ok(false), |bond| radio.keep(&bond))
+    bond.map_or(Ok(radio.link.keeps_bonds()), |bond| radio.keep(&bond))
 }
 
 /// The tag of an object id or an address. One id on two tags is an error: one of them is not what

@@ -4,7 +4,6 @@ use std::time::Duration;
 
 use clap::Args;
 use serde::Serialize;
-use vergence_devices::TagLink;
 use vergence_tag::Record;
 
 use crate::failure::Failure;
