@@ -13,7 +13,7 @@ guest_need qemu-system-x86_64=qemu-system-x86 busybox=busybox-static cpio=cpio v
 guest_kernel
 cargo build -q --locked -p vergence-devices --example v4l2_probe
 guest_files "$guest/v4l2" vivid -- v4l2-ctl target/debug/examples/v4l2_probe
-guest_run "$guest/v4l2" 180 <<'INIT'
+guest_run "$guest/v4l2" 150 <<'INIT'
 # One camera of the kind "webcam" with a picture that stands still, stamped at the start of exposure.
 modprobe vivid n_devs=1 node_types=0x1 num_inputs=1 input_types=0x0
 v4l2-ctl -d /dev/video0 --set-ctrl osd_text_mode=2,test_pattern=0,timestamp_source=1

@@ -4,15 +4,18 @@
 //! progress go to standard error. Exit status: 0 when the thing asked for was achieved, 1 when not
 //! (the output says why), 2 for misuse.
 
+mod bench;
 mod commands;
 mod drivers;
 mod failure;
 mod interrupt;
+mod light;
 mod output;
 mod progress;
 mod radio;
 mod robot;
 mod save;
+mod signing;
 
 use std::process::ExitCode;
 

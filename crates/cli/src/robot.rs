@@ -1,17 +1,24 @@
 //! Opens the robot that a command works with: the configured devices, or the simulated workcell.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use clap::Args;
 use vergence::System;
-use vergence::report::{Report, TruthReport, numbers};
+use vergence::report::{PhysicsReport, Report, TruthReport, numbers};
 use vergence_devices::{Config, Description, Robot};
 use vergence_geometry::Transform;
 use vergence_sim::{Scenario, SimConfig, Workcell};
+use vergence_tag::signature::TrustedKeys;
 
-use crate::drivers::{self, HCI, SIM};
+use crate::bench::{self, SharedBench};
+use crate::drivers::{self, BLUEZ, HCI, SIM};
 use crate::failure::Failure;
 use crate::radio::{self, Radio};
+use crate::signing;
+
+/// Key of `[sim]` for [`built`].
+pub const BUILT: &str = "built";
 
 /// Which robot.
 #[derive(Args, Clone, Default)]
@@ -33,7 +40,9 @@ pub struct Opened {
     /// URDF.
     pub description: Description,
     /// The simulator, when it serves the devices.
-    workcell: Option<Workcell>,
+    workcell: Option<Arc<Workcell>>,
+    /// The contacts of the simulated arm, when it is attached.
+    bench: Option<SharedBench>,
 }
 
 /// How far a reported pose is from the simulator's truth.
@@ -50,18 +59,20 @@ impl RobotArgs {
         match &self.config {
             Some(path) => {
                 let (config, description) = read(path)?;
-                check_radio(&config)?;
+                check_drivers(&config)?;
+                let signers = signing::required(&config, folder(path))?;
                 if !drivers::simulated(&config)? {
                     let devices = drivers::open(&config, &description, folder(path))?;
-                    return Opened::wired(config, description, devices);
+                    let opened = Opened::wired(config, description, devices)?;
+                    return Ok(opened.signed_by(signers));
                 }
-                let workcell = Workcell::from_config(&config, &description, self.seed);
-                let workcell = workcell.map_err(unusable)?;
+                let workcell = self.workcell(path, &config, &description)?;
                 let mut devices = workcell.robot();
-                if config.radio.driver == HCI {
-                    devices.radio = Box::new(radio::open(&config, folder(path))?.link);
+                if config.radio.driver != SIM {
+                    devices.radio = radio::open(&config, folder(path))?.link;
                 }
-                Opened::new(workcell, devices)
+                let opened = Opened::new(workcell, devices, config, description)?;
+                Ok(opened.signed_by(signers))
             }
             None => Opened::embedded(self.seed, Scenario::Default),
         }
@@ -70,7 +81,13 @@ impl RobotArgs {
     /// What a simulated workcell is made of: the configuration's, else the embedded one's.
     pub fn simulation(&self) -> Result<(Config, Description, SimConfig), Failure> {
         let (config, description) = match &self.config {
-            Some(path) => read(path)?,
+            Some(path) => {
+                let (config, description) = read(path)?;
+                match built(path, &config)? {
+                    Some(other) => read(&other)?,
+                    None => (config, description),
+                }
+            }
             None => vergence_sim::embedded_files().map_err(unusable)?,
         };
         let settings = vergence_sim::settings(&config).map_err(unusable)?;
@@ -79,18 +96,39 @@ impl RobotArgs {
 
     /// Opens the tag radio alone.
     pub fn open_radio(&self) -> Result<Radio, Failure> {
-        let workcell = match &self.config {
+        let (workcell, trusted) = match &self.config {
             Some(path) => {
                 let (config, description) = read(path)?;
-                check_radio(&config)?;
-                if config.radio.driver == HCI {
+                check_drivers(&config)?;
+                if config.radio.driver != SIM {
                     return radio::open(&config, folder(path));
                 }
+                let trusted = signing::trusted(&config, folder(path))?;
+                (self.workcell(path, &config, &description)?, trusted)
+            }
+            None => {
+                (Workcell::embedded(self.seed).map_err(unusable)?, TrustedKeys::default())
+            }
+        };
+        Ok(Radio::simulated(&workcell, trusted))
+    }
+
+    /// The simulated workcell of a configuration. A calibrated configuration names the one from which
+    /// the head was built, which stays as it is whatever is now believed of it.
+    fn workcell(
+        &self,
+        path: &Path,
+        config: &Config,
+        description: &Description,
+    ) -> Result<Workcell, Failure> {
+        let workcell = match built(path, config)? {
+            Some(other) => {
+                let (config, description) = read(&other)?;
                 Workcell::from_config(&config, &description, self.seed)
             }
-            None => Workcell::embedded(self.seed),
+            None => Workcell::from_config(config, description, self.seed),
         };
-        Ok(Radio::simulated(&workcell.map_err(unusable)?))
+        workcell.map_err(unusable)
     }
 }
 
@@ -99,19 +137,60 @@ impl Opened {
     pub fn embedded(seed: u64, scenario: Scenario) -> Result<Self, Failure> {
         let workcell = Workcell::embedded_as(scenario, seed).map_err(unusable)?;
         let devices = workcell.robot();
-        Self::new(workcell, devices)
+        let (config, description) = (workcell.config().clone(), workcell.description().clone());
+        Self::new(workcell, devices, config, description)
     }
 
     /// A robot whose devices are not the simulator's.
     fn wired(config: Config, description: Description, devices: Robot) -> Result<Self, Failure> {
         let system = System::new(devices, &config, &description).map_err(unusable)?;
-        Ok(Opened { system, config, description, workcell: None })
+        Ok(Opened { system, config, description, workcell: None, bench: None })
     }
 
-    fn new(workcell: Workcell, devices: Robot) -> Result<Self, Failure> {
-        let (config, description) = (workcell.config().clone(), workcell.description().clone());
+    fn new(
+        workcell: Workcell,
+        devices: Robot,
+        config: Config,
+        description: Description,
+    ) -> Result<Self, Failure> {
         let system = System::new(devices, &config, &description).map_err(unusable)?;
-        Ok(Opened { system, config, description, workcell: Some(workcell) })
+        let workcell = Some(Arc::new(workcell));
+        Ok(Opened { system, config, description, workcell, bench: None })
+    }
+
+    /// The simulator, when it serves the devices.
+    pub fn simulator(&self) -> Option<Arc<Workcell>> {
+        self.workcell.clone()
+    }
+
+    /// Gives the robot its arm, when it has one: contacts are simulated around one object. With
+    /// `photographs` the stages are kept for [`Opened::save_grasp`].
+    pub fn attach_arm(&mut self, object: &str, photographs: bool) -> Result<(), Failure> {
+        let (Some(workcell), Some(_)) = (&self.workcell, &self.config.arm) else { return Ok(()) };
+        let built = bench::build(workcell, &self.description, object, photographs)?;
+        if let Some((arm, bench)) = built {
+            self.system.robot.arm = Some(Box::new(arm));
+            self.system.hand = Some(bench::hand(&self.description)?);
+            self.bench = Some(bench);
+        }
+        Ok(())
+    }
+
+    /// Writes the grasp as an onlooker saw it (`stages.png`) and for a second physics engine
+    /// (`replay.json`), in simulation.
+    pub fn save_grasp(&self, dir: &Path) -> Result<(), Failure> {
+        self.bench.as_ref().map_or(Ok(()), |bench| bench::lock(bench).save(dir))
+    }
+
+    /// The physics' verdict on what the arm did, in simulation.
+    pub fn physics(&self) -> Option<PhysicsReport> {
+        self.bench.as_ref().map(|bench| bench::lock(bench).verdict())
+    }
+
+    /// The same, for records that one of these keys signed.
+    fn signed_by(mut self, signers: Option<TrustedKeys>) -> Self {
+        self.system.required_signers = signers;
+        self
     }
 
     /// The simulator's truth of an object.
@@ -159,11 +238,24 @@ fn folder(path: &Path) -> &Path {
     path.parent().unwrap_or(Path::new(""))
 }
 
-/// Refuses a radio driver that does not exist.
-fn check_radio(config: &Config) -> Result<(), Failure> {
+/// The configuration that a calibrated one of the simulated workcell was made from: `[sim] built`.
+fn built(path: &Path, config: &Config) -> Result<Option<PathBuf>, Failure> {
+    let Some(named) = config.sim.as_ref().and_then(|sim| sim.get(BUILT)) else { return Ok(None) };
+    match named.as_str() {
+        Some(name) => Ok(Some(folder(path).join(name))),
+        None => Err(Failure::misuse("[sim] built is not a path", "calibrate anew")),
+    }
+}
+
+/// Refuses drivers of radio and arm that do not exist.
+fn check_drivers(config: &Config) -> Result<(), Failure> {
     match config.radio.driver.as_str() {
-        SIM | HCI => Ok(()),
-        other => Err(drivers::unknown("radio", other, HCI)),
+        SIM | HCI | BLUEZ => {}
+        other => return Err(drivers::unknown("radio", other, "hci, bluez")),
+    }
+    match &config.arm {
+        Some(arm) if arm.driver != SIM => Err(drivers::unknown("arm", &arm.driver, "no other")),
+        _ => Ok(()),
     }
 }
 

@@ -180,7 +180,7 @@ fn taped(tapes: &Tapes, devices: Option<Robot>) -> Robot {
         Box::new(Taped { tapes: tapes.clone(), side, device })
     }
     let (clock, heads, radio) = match devices {
-        Some(Robot { clock, heads, radio }) => (Some(clock), heads.map(Some), Some(radio)),
+        Some(Robot { clock, heads, radio, .. }) => (Some(clock), heads.map(Some), Some(radio)),
         None => (None, [None, None], None),
     };
     let mut side = 0;
@@ -194,7 +194,7 @@ fn taped(tapes: &Tapes, devices: Option<Robot>) -> Robot {
         side += 1;
         head
     });
-    Robot { clock: tape(tapes, 0, clock), heads, radio: tape(tapes, 0, radio) }
+    Robot { clock: tape(tapes, 0, clock), heads, radio: tape(tapes, 0, radio), arm: None }
 }
 
 fn find(robot: Robot) -> Report {

@@ -12,7 +12,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use vergence_devices::clock::SystemClock;
-use vergence_devices::v4l2::{PixelFormat, V4l2Camera, V4l2Config};
+use vergence_devices::v4l2::{Counts, PixelFormat, V4l2Camera, V4l2Config};
 use vergence_devices::{Camera, Clock, DeviceError};
 use vergence_imaging::{Frame, Image};
 
@@ -272,28 +272,44 @@ impl Probe {
         Ok(format!("told to drop 30 %: 60 frames read, {missing} missing, {counts:?}"))
     }
 
-    /// Reads until a number is missing; the numbers around the gap.
-    fn gap(&self, camera: &mut V4l2Camera) -> Result<(u64, u64), Box<dyn Error>> {
+    /// Orders a fault and reads until it was counted, and three frames more; the numbers of the first
+    /// and the last frame and how many are missing between them, all of which must be counted.
+    fn after_fault(
+        &self,
+        camera: &mut V4l2Camera,
+        fault: &str,
+        happened: fn(&Counts) -> bool,
+    ) -> Result<(u64, u64, u64), Box<dyn Error>> {
+        let first = camera.next_frame(SOON)?.sequence;
+        self.set(fault)?;
         let begin = Instant::now();
-        let mut last = camera.next_frame(SOON)?.sequence;
-        loop {
-            let next = camera.next_frame(SOON)?.sequence;
-            if next > last + 1 {
-                return Ok((last, next));
+        let (mut read, mut more) = (1, 3);
+        let last = loop {
+            let last = camera.next_frame(SOON)?.sequence;
+            read += 1;
+            if happened(&camera.counts()) {
+                more -= 1;
             }
-            last = next;
-            ensure(begin.elapsed() < SOON, || format!("no gap, {:?}", camera.counts()))?;
-        }
+            if more == 0 {
+                break last;
+            }
+            ensure(begin.elapsed() < SOON, || format!("{:?}", camera.counts()))?;
+        };
+        let counts = camera.counts();
+        let missing = last + 1 - first - read;
+        ensure(missing > 0 && missing <= counts.lost + counts.damaged + counts.skipped, || {
+            format!("{missing} missing from {first} to {last}, counted {counts:?}")
+        })?;
+        Ok((first, last, missing))
     }
 
     fn damaged(&self) -> Outcome {
         let mut camera = self.grey()?;
-        camera.next_frame(SOON)?;
-        self.set("inject_v4l2_buf_flag_error=1")?;
-        let (last, next) = self.gap(&mut camera)?;
+        let fault = "inject_v4l2_buf_flag_error=1";
+        let (first, last, missing) =
+            self.after_fault(&mut camera, fault, |counts| counts.damaged == 1)?;
         let counts = camera.counts();
-        ensure(counts.damaged == 1 && next == last + 2, || format!("{last}, {next}, {counts:?}"))?;
-        Ok(format!("frame {next} follows frame {last}, {counts:?}"))
+        Ok(format!("frames {first} to {last}, {missing} missing, {counts:?}"))
     }
 
     fn silent(&self) -> Outcome {
@@ -316,12 +332,11 @@ impl Probe {
 
     fn broken(&self) -> Outcome {
         let mut camera = self.grey()?;
-        camera.next_frame(SOON)?;
-        self.set("inject_fatal_streaming_error=1")?;
-        let (last, next) = self.gap(&mut camera)?;
+        let fault = "inject_fatal_streaming_error=1";
+        let (first, last, missing) =
+            self.after_fault(&mut camera, fault, |counts| counts.restarts == 1)?;
         let counts = camera.counts();
-        ensure(counts.restarts == 1, || format!("{counts:?}"))?;
-        Ok(format!("started again by itself, frame {next} follows frame {last}, {counts:?}"))
+        Ok(format!("goes on by itself, frames {first} to {last}, {missing} missing, {counts:?}"))
     }
 
     fn unplugged(&self) -> Outcome {

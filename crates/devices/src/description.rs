@@ -74,6 +74,28 @@ impl Description {
 
     /// The chain of revolute joints from one link to another, fixed joints folded in.
     pub fn chain(&self, root: &str, tip: &str) -> Result<Chain, DescriptionError> {
+        let mut joints = Vec::new();
+        let mut pending = Transform::identity();
+        for joint in self.path(root, tip)? {
+            let parent_from_joint = pending * transform(&joint.origin);
+            match joint.joint_type {
+                JointType::Fixed => pending = parent_from_joint,
+                JointType::Revolute | JointType::Continuous => {
+                    joints.push(revolute(joint, parent_from_joint)?);
+                    pending = Transform::identity();
+                }
+                _ => return Err(DescriptionError::Joint(joint.name.clone())),
+            }
+        }
+        Ok(Chain { joints, last_from_tip: pending })
+    }
+
+    /// The joints from one link to another, in this order.
+    pub(crate) fn path(
+        &self,
+        root: &str,
+        tip: &str,
+    ) -> Result<Vec<&urdf_rs::Joint>, DescriptionError> {
         for link in [root, tip] {
             if !self.robot.links.iter().any(|l| l.name == link) {
                 return Err(DescriptionError::NoLink(link.into()));
@@ -92,20 +114,8 @@ impl Description {
         if link != root {
             return Err(DescriptionError::NoChain { root: root.into(), tip: tip.into() });
         }
-        let mut joints = Vec::new();
-        let mut pending = Transform::identity();
-        for joint in upwards.into_iter().rev() {
-            let parent_from_joint = pending * transform(&joint.origin);
-            match joint.joint_type {
-                JointType::Fixed => pending = parent_from_joint,
-                JointType::Revolute | JointType::Continuous => {
-                    joints.push(revolute(joint, parent_from_joint)?);
-                    pending = Transform::identity();
-                }
-                _ => return Err(DescriptionError::Joint(joint.name.clone())),
-            }
-        }
-        Ok(Chain { joints, last_from_tip: pending })
+        upwards.reverse();
+        Ok(upwards)
     }
 
     /// The chain from `root` to `tip`, refused unless it moves by exactly the named joints.

@@ -7,6 +7,7 @@
 
 mod arm;
 pub mod bodies;
+pub mod calibrated;
 pub mod clock;
 pub mod config;
 pub mod description;

@@ -6,6 +6,8 @@ use std::time::Duration;
 use vergence_imaging::Frame;
 use vergence_tag::Pattern;
 
+use crate::arm::Arm;
+
 /// What can go wrong with a device.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum DeviceError {
@@ -187,4 +189,6 @@ pub struct Robot {
     pub heads: [Head; 2],
     /// The tag radio.
     pub radio: Box<dyn TagLink>,
+    /// The arm, on robots that have one.
+    pub arm: Option<Box<dyn Arm>>,
 }

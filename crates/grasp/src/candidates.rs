@@ -299,7 +299,8 @@ impl Maker<'_> {
         })
     }
 
-    /// One finger inside the cup, one outside; the tip above the wall, its y axis outwards.
+    /// One finger inside the cup, one outside; the tip above the wall, its y axis outwards. The hand
+    /// leans with the wall, so that both pads lie flat on it: on an edge they would turn the cup.
     fn of_rim(&self, height: f64) -> Vec<Grasp> {
         let landmarks = self.record.landmarks.iter().map(|s| s.position[1].atan2(s.position[0]));
         let azimuths: Vec<f64> = landmarks.chain((0..24).map(|n| n as f64 * TAU / 24.0)).collect();
@@ -323,13 +324,20 @@ impl Maker<'_> {
         let hole = 2.0 * (tip - self.assumed.wall);
         let inner = (hole - g.thickness) / 2.0;
         let side = inner.min(SPREAD).min((g.opening - self.assumed.wall) / 2.0);
+        let rim = object::radius_at(self.record, top)?;
+        let lean = (rim - object::radius_at(self.record, top - depth)?).atan2(depth);
+        let (sin, cos) = lean.sin_cos();
+        let down = -Vector3::z() * cos - radial(azimuth) * sin;
+        let outwards = radial(azimuth) * cos - Vector3::z() * sin;
         let middle = outer - self.assumed.wall / 2.0;
         Some(Grasp {
             hold: Hold::Rim,
             object_from_tip: frame(
-                radial(azimuth) * middle + Vector3::z() * (top - depth),
-                -Vector3::z(),
-                radial(azimuth),
+                radial(azimuth) * middle
+                    + Vector3::z() * (top - depth / 2.0)
+                    + down * (depth / 2.0),
+                down,
+                outwards,
             ),
             width: self.assumed.wall,
             opening: self.assumed.wall + 2.0 * side,

@@ -78,7 +78,7 @@ impl Fixator {
             return NextMove::Hold;
         }
         self.moves += 1;
-        NextMove::Go { via: approach(head, angles, goal, &self.config), goal }
+        NextMove::Go { via: run_up(head, angles, goal, &self.config), goal }
     }
 
     /// Moves planned so far.
@@ -89,20 +89,20 @@ impl Fixator {
 
 /// The waypoint from which a move to `goal` ends upwards in both joints by more than the slack;
 /// `None` when the direct way does that already.
-fn approach(
+pub fn run_up(
     head: &PanTiltHead,
     angles: [f64; 2],
     goal: [f64; 2],
     config: &FixatorConfig,
 ) -> Option<[f64; 2]> {
     // Servos round both the waypoint and the goal to their steps: one step more keeps them apart.
-    let run_up = 1.5 * config.backlash + config.resolution;
-    if config.backlash <= 0.0 || (0..2).all(|k| goal[k] - angles[k] >= run_up) {
+    let length = 1.5 * config.backlash + config.resolution;
+    if config.backlash <= 0.0 || (0..2).all(|k| goal[k] - angles[k] >= length) {
         return None;
     }
-    let via = [0, 1].map(|k| match goal[k] - angles[k] >= run_up {
+    let via = [0, 1].map(|k| match goal[k] - angles[k] >= length {
         true => angles[k],
-        false => goal[k] - run_up,
+        false => goal[k] - length,
     });
     Some(head.clamp(via))
 }

@@ -17,6 +17,7 @@
 // An index names a head or a joint in several arrays at once; zipped iterators would hide which.
 #![allow(clippy::needless_range_loop)]
 
+mod bounded;
 pub mod calibration;
 pub mod evaluation;
 mod fixation;
@@ -26,7 +27,7 @@ mod search;
 mod triangulation;
 
 pub use calibration::{Calibration, CalibrationConfig, calibrate};
-pub use fixation::{Fixator, FixatorConfig, NextMove, dither};
+pub use fixation::{Fixator, FixatorConfig, NextMove, dither, run_up};
 pub use kinematics::{HeadError, PanTiltHead};
 pub use paper::{PaperAngles, paper_distance};
 pub use search::{Field, Search, SearchConfig};

@@ -10,6 +10,7 @@
 //! soon as a stated false-alarm rate allows.
 
 mod finder;
+pub mod near;
 pub mod paper;
 pub mod sequential;
 pub mod synthetic;

@@ -12,11 +12,13 @@
 #[cfg(feature = "bluez")]
 mod bluez;
 mod central;
+mod conversation;
 mod ears;
 mod flash;
 mod hci;
 mod job;
 mod pool;
+mod radio;
 mod server;
 mod simulation;
 mod virtual_tag;
@@ -28,6 +30,7 @@ pub use flash::{BLOCK, MemoryFlash, OutOfBounds};
 pub use hci::HciLink;
 pub use job::{BOND_BYTES, Bond, TagInfo};
 pub use pool::{HeapPacket, HeapPool};
+pub use radio::TagRadio;
 pub use server::TagServer;
 pub use simulation::{RadioConfig, VirtualRadio};
 pub use virtual_tag::{LightPlay, Plays, VirtualTag};

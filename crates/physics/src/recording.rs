@@ -13,22 +13,50 @@
 //! start.
 
 use serde_json::{Value, json};
-use vergence_geometry::{Solid, Trajectory, Transform};
-use vergence_grasp::Plan;
+use vergence_devices::GripCommand;
+use vergence_geometry::{JointAngles, Solid, Trajectory, Transform};
+use vergence_grasp::{Obstacle, Plan};
 
 use crate::experiment::Trial;
+use crate::world::TrueObject;
+
+/// One thing that arm or gripper were told and did.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Motion {
+    /// The fingers.
+    Grip(GripCommand),
+    /// The arm.
+    Move(Trajectory),
+}
 
 /// The motions of a trial's plan, from the posture in which its transfer starts; `None` when there was
 /// no plan.
 pub fn of_trial(trial: &Trial) -> Option<Value> {
     let plan = trial.plan.as_ref().ok()?;
-    let object = &trial.object;
+    let start = plan.transfer.waypoints.first()?.positions;
+    Some(of_motions(&start, &trial.object, &trial.obstacles, &motions(plan)))
+}
+
+/// Motions from a posture on, the object and the obstacles being where they were before the first.
+pub fn of_motions(
+    start: &JointAngles,
+    object: &TrueObject,
+    obstacles: &[Obstacle],
+    motions: &[Motion],
+) -> Value {
     let solids: Vec<Value> =
         object.solids.iter().map(|p| solid(&p.object_from_solid, &p.solid)).collect();
     let obstacles: Vec<Value> =
-        trial.obstacles.iter().map(|o| solid(&o.base_from_solid, &o.solid)).collect();
-    Some(json!({
-        "start": plan.transfer.waypoints.first()?.positions,
+        obstacles.iter().map(|o| solid(&o.base_from_solid, &o.solid)).collect();
+    let motions: Vec<Value> = motions
+        .iter()
+        .map(|motion| match motion {
+            Motion::Grip(g) => json!({"grip": {"width": g.width, "force": g.force}}),
+            Motion::Move(trajectory) => along(trajectory),
+        })
+        .collect();
+    json!({
+        "start": start,
         "object": {
             "pose": pose(&object.base_from_object),
             "mass": object.mass,
@@ -36,18 +64,18 @@ pub fn of_trial(trial: &Trial) -> Option<Value> {
             "solids": solids,
         },
         "obstacles": obstacles,
-        "motions": motions(plan),
-    }))
+        "motions": motions,
+    })
 }
 
-fn motions(plan: &Plan) -> Vec<Value> {
-    let grip = |width: f64, force: f64| json!({"grip": {"width": width, "force": force}});
+fn motions(plan: &Plan) -> Vec<Motion> {
+    let grip = |width: f64| Motion::Grip(GripCommand { width, force: plan.force });
     vec![
-        grip(plan.grasp.opening, plan.force),
-        along(&plan.transfer),
-        along(&plan.approach),
-        grip(0.0, plan.force),
-        along(&plan.lift),
+        grip(plan.grasp.opening),
+        Motion::Move(plan.transfer.clone()),
+        Motion::Move(plan.approach.clone()),
+        grip(0.0),
+        Motion::Move(plan.lift.clone()),
     ]
 }
 

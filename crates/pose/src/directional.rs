@@ -7,39 +7,32 @@
 //! that a different pose would not ([`verdict`]).
 
 pub mod edges;
+mod equations;
 pub mod field;
 pub mod level;
+mod neighbours;
 pub mod picture;
 pub mod refine;
 pub mod search;
 pub mod sites;
 pub mod verdict;
 
-use nalgebra::{Matrix6, Vector3};
+use nalgebra::Vector3;
 use vergence_geometry::{GaussianPose, Transform};
 
 use crate::model::Model;
 use crate::types::{Alternative, ObjectPose, Query, Refusal, View, check};
 use field::Field;
 use level::{Level, Region};
-use refine::{EDGE_SD_PX, Pass, Refined};
+use refine::{FINAL, Pass, Refined};
 use search::{Search, Sight};
 use sites::Site;
 use verdict::Explained;
 
-/// The information counts what is modelled; measured errors have about this much more variance.
-const INFLATION: f64 = 2.5;
-/// No rotation is known better than this (rad): edges of real objects are not that straight.
-const ROTATION_FLOOR: f64 = 0.003;
-
-/// Covariance with what the model leaves out, so that the truth lies inside as often as it says.
-fn honest(covariance: &Matrix6<f64>) -> Matrix6<f64> {
-    let mut out = covariance * INFLATION;
-    for k in 0..3 {
-        out[(k, k)] += ROTATION_FLOOR * ROTATION_FLOOR;
-    }
-    out
-}
+/// Roughly refined poses that get their chance however far behind (nats) they are, and how far behind
+/// others may be: the rough contour of a tilted or hidden object may explain little.
+const SURE_FINALISTS: usize = 4;
+const BEHIND: f64 = 30.0;
 
 /// Alternatives reported.
 const MOST_ALTERNATIVES: usize = 4;
@@ -62,7 +55,7 @@ pub struct Config {
     pub climb_halvings: usize,
     /// Hypotheses refined on the pictures at the working scale.
     pub refined: usize,
-    /// Of those, how many are refined at full resolution.
+    /// Of those, how many are refined at full resolution at most.
     pub finalists: usize,
     /// Cosine between the landmark's normal and the line of sight below which no camera sees it.
     pub grazing: f64,
@@ -88,7 +81,7 @@ impl Default for Config {
             seeds: 32,
             climb_halvings: 3,
             refined: 16,
-            finalists: 10,
+            finalists: 6,
             grazing: 0.1,
             distinct: 2f64.to_radians(),
             different: 6f64.to_radians(),
@@ -132,9 +125,15 @@ pub fn recognise_traced<'a>(
     let hypotheses = search.hypotheses();
     let rough = hypotheses.iter().map(|h| search.refine_roughly(&h.pose, h.rests)).collect();
     let rough = search.ranked(rough, config.distinct);
-    let finalists = rough.iter().take(config.finalists);
-    let fine = finalists.map(|(rough, _)| search.refine_finely(rough.clone())).collect();
-    let different = search.ranked(fine, config.different);
+    let fine = search.finalists(rough).into_iter().map(|r| search.refine_finely(r)).collect();
+    let mut fine = search.ranked(fine, config.different);
+    if let Some(twins) = fine.first().map(|best| search.twins(&best.0)) {
+        fine.extend(twins);
+    }
+    let mut different = search.ranked(fine, config.different);
+    if let Some(best) = different.first_mut() {
+        search.settle(best);
+    }
     let result = search.verdict(&different);
     let poses = different.iter().map(|(r, _)| r.pose).collect();
     let sites = different.into_iter().next().map(|(r, _)| r.sites).unwrap_or_default();
@@ -158,7 +157,9 @@ pub fn track(
     }
     let search = Search { sights: &sights, model: &model, query, landmark, normal, config };
     let (rough, _) = search.refine_roughly(last, false);
-    let found = search.verdict(&[search.refine_finely(rough)])?;
+    let (mut refined, explained) = search.refine_finely(rough);
+    search.doubt(&mut refined, &FINAL);
+    let found = search.verdict(&[(refined, explained)])?;
     let turned = query.symmetry().angle_between(&found.pose.pose.rotation, &last.rotation);
     if turned > config.most_turn {
         return Err(Refusal::Lost { turned_deg: turned.to_degrees(), best: Box::new(found) });
@@ -179,6 +180,7 @@ fn prepare<'a>(
     let reach = (landmark.abs() + half).norm() + 0.01;
     views
         .iter()
+        .take(equations::VIEWS)
         .filter_map(|view| {
             let optical_from_base = view.base_from_optical.inverse();
             let p = optical_from_base * query.landmark.position;
@@ -213,11 +215,19 @@ impl Search<'_> {
     /// Refinement at the working scale, wide and coarse: enough to tell which hypothesis is right.
     fn refine_roughly(&self, start: &Transform, rests: bool) -> (Refined, Explained) {
         let s = self.scale();
-        let passes = [(2.5, 7.0, 4.0), (1.5, 5.0, 4.0), (1.0, 4.0, 3.0)]
+        let passes = [(2.5, 7.0, 5.0), (1.2, 5.0, 5.0)]
             .map(|(sd, range, spacing)| Pass::new(s * sd, s * range, s * spacing, false));
         let mut refined = Refined::new(start, rests, self.sights.len());
         self.refine(&mut refined, &passes);
         self.weigh(refined, &Pass::new(0.5 * s, 4.0 * s, 3.0 * s, false))
+    }
+
+    /// Those worth the full resolution: the best, and as long as they are not far behind, others.
+    fn finalists(&self, rough: Vec<(Refined, Explained)>) -> Vec<Refined> {
+        let best = rough.first().map_or(0.0, |r| r.1.evidence);
+        let few = rough.into_iter().take(self.config.finalists).enumerate();
+        let worth = few.filter(|(k, r)| *k < SURE_FINALISTS || best - r.1.evidence < BEHIND);
+        worth.map(|(_, r)| r.0).collect()
     }
 
     /// Refinement down to full resolution.
@@ -229,9 +239,13 @@ impl Search<'_> {
             passes.push(Pass::new(s, 4.0 * s, 2.5 * s, true));
         }
         passes.push(Pass::new(0.6, 4.0, 2.5, true));
-        passes.push(Pass::new(EDGE_SD_PX, 4.0, 2.0, true));
-        passes.push(Pass::new(EDGE_SD_PX, 4.0, 2.0, true));
+        passes.extend([FINAL, FINAL]);
         self.refine(&mut refined, &passes);
+        self.both(refined)
+    }
+
+    /// What a refined pose explains at both scales.
+    fn both(&self, refined: Refined) -> (Refined, Explained) {
         // Print is fine, outlines are coarse: both scales have their say in what is explained.
         let s = self.scale();
         let (refined, coarse) = self.weigh(refined, &Pass::new(0.5 * s, 4.0 * s, 2.0 * s, false));
@@ -269,16 +283,10 @@ impl Search<'_> {
         kept
     }
 
-    /// Poses whose contour is the same but for the tolerance of form, with their odds against this
-    /// one: only the landmark's place can tell them apart.
-    fn twins(&self, pose: &Transform) -> Vec<(Transform, f64)> {
+    /// Poses whose contour is the same but for the tolerance of form, refined on their own: little
+    /// but the landmark's place tells them apart.
+    fn twins(&self, of: &Refined) -> Vec<(Refined, Explained)> {
         let known = self.query.symmetry();
-        let weight = self.query.landmark.covariance.try_inverse().unwrap_or_default();
-        let misfit = |p: &Transform| {
-            let seen = p.rotation * self.landmark + p.translation.vector;
-            let residual = self.query.landmark.position.coords - seen;
-            (residual.transpose() * weight * residual).x
-        };
         let stands = |p: &Transform| {
             let up = self.query.up.map_or(0.0, |up| (p.rotation * Vector3::z()).dot(&up));
             self.query.standing != Some(true) || up > 0.0
@@ -286,10 +294,14 @@ impl Search<'_> {
         self.query
             .near_symmetries()
             .into_iter()
-            .map(|s| Transform::from_parts(pose.translation, pose.rotation * s))
-            .filter(|p| known.angle_between(&p.rotation, &pose.rotation) > self.config.different)
+            .map(|s| Transform::from_parts(of.pose.translation, of.pose.rotation * s))
+            .filter(|p| known.angle_between(&p.rotation, &of.pose.rotation) > self.config.different)
             .filter(stands)
-            .map(|p| (p, (0.5 * (misfit(pose) - misfit(&p))).exp()))
+            .map(|pose| {
+                let mut twin = Refined { pose, offsets: Vec::new(), ..of.clone() };
+                self.refine(&mut twin, &[Pass::new(0.6, 4.0, 2.5, true), FINAL, FINAL]);
+                self.both(twin)
+            })
             .collect()
     }
 
@@ -299,21 +311,14 @@ impl Search<'_> {
             return Err(Refusal::NoAttitude);
         };
         let odds = |e: &Explained| (e.evidence - explained.evidence).exp();
-        let twins = self.twins(&best.pose);
-        let total = 1.0
-            + others.iter().map(|o| odds(&o.1)).sum::<f64>()
-            + twins.iter().map(|(_, odds)| odds).sum::<f64>();
+        let total = 1.0 + others.iter().map(|o| odds(&o.1)).sum::<f64>();
         let others = others.iter().map(|o| (o.0.pose, odds(&o.1)));
-        let mut alternatives: Vec<Alternative> = twins
-            .iter()
-            .copied()
-            .chain(others)
-            .map(|(pose, odds)| Alternative { pose, confidence: odds / total })
-            .collect();
+        let mut alternatives: Vec<Alternative> =
+            others.map(|(pose, odds)| Alternative { pose, confidence: odds / total }).collect();
         alternatives.sort_by(|a, b| b.confidence.total_cmp(&a.confidence));
         alternatives.truncate(MOST_ALTERNATIVES);
         let found = ObjectPose {
-            pose: GaussianPose { pose: best.pose, covariance: honest(&best.covariance) },
+            pose: GaussianPose { pose: best.pose, covariance: best.covariance },
             confidence: 1.0 / total,
             coverage: explained.coverage,
             alternatives,

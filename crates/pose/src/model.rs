@@ -42,6 +42,11 @@ pub struct Segment {
     /// Outward normal of the face that turns away there, for silhouettes where it is flat: an
     /// object that rests on that face has a shadow, not a background, on the other side.
     pub away: Option<Vector3<f64>>,
+    /// Which part of the body it lies on: the same number means the same edge of a polyhedron, rim
+    /// or side of a wall for every eye.
+    pub part: u16,
+    /// How far along the part it begins (m).
+    pub along: f64,
 }
 
 /// The visible contour: reused between calls so that the search does not allocate.
@@ -65,6 +70,10 @@ pub(crate) struct Line {
     pub kind: Kind,
     /// As in [`Segment`].
     pub away: Option<Vector3<f64>>,
+    /// As in [`Segment`].
+    pub part: u16,
+    /// As in [`Segment`].
+    pub along: f64,
 }
 
 impl Outline {
@@ -132,6 +141,8 @@ impl Model {
             to: at(line.ends[1]),
             kind: line.kind,
             away: line.away,
+            part: line.part,
+            along: line.along,
         }));
     }
 

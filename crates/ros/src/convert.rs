@@ -9,7 +9,7 @@ use std::f64::consts::PI;
 use std::time::Duration;
 
 use nalgebra::{Matrix3, Matrix6, Point3, Quaternion, UnitQuaternion};
-use vergence_geometry::{Camera, GaussianPoint, GaussianPose, Transform};
+use vergence_geometry::{Camera, GaussianPoint, GaussianPose, Trajectory, Transform, Waypoint};
 use vergence_imaging::{CodecError, Frame, codec};
 
 use crate::msg::geometry_msgs::{
@@ -18,6 +18,7 @@ use crate::msg::geometry_msgs::{
 };
 use crate::msg::sensor_msgs::{CameraInfo, CompressedImage, Image, JointState, RegionOfInterest};
 use crate::msg::std_msgs::Header;
+use crate::msg::trajectory_msgs::{JointTrajectory, JointTrajectoryPoint};
 
 /// Index in ROS's order (translation, rotation) of each index of ours (rotation, translation).
 const ROS_FROM_OURS: [usize; 6] = [3, 4, 5, 0, 1, 2];
@@ -71,6 +72,25 @@ pub fn joint_state(stamp: Duration, joints: &[(&str, f64)]) -> JointState {
         name: joints.iter().map(|(name, _)| name.to_string()).collect(),
         position: joints.iter().map(|(_, position)| *position).collect(),
         ..JointState::default()
+    }
+}
+
+/// A motion of six joints as a controller is told it; `start` is when it begins.
+pub fn joint_trajectory(
+    trajectory: &Trajectory,
+    names: &[String; 6],
+    start: Duration,
+) -> JointTrajectory {
+    let point = |waypoint: &Waypoint| JointTrajectoryPoint {
+        positions: waypoint.positions.to_vec(),
+        velocities: waypoint.velocities.to_vec(),
+        time_from_start: Duration::from_secs_f64(waypoint.time.max(0.0)).into(),
+        ..JointTrajectoryPoint::default()
+    };
+    JointTrajectory {
+        header: header(start, ""),
+        joint_names: names.to_vec(),
+        points: trajectory.waypoints.iter().map(point).collect(),
     }
 }
 

@@ -44,6 +44,8 @@ pub enum Scenario {
     Default,
     /// Something stands before the object "cup" (else before the last one); its LED stays in view.
     Occluded,
+    /// The object "cup" stands within the arm's reach.
+    Reach,
 }
 
 /// Camera model.
@@ -76,11 +78,11 @@ pub struct CameraSettings {
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct ServoSettings {
-    /// Encoder step (degrees).
+    /// Encoder step (degrees); a servo rests anywhere within the step that it reads.
     pub resolution_deg: f64,
     /// Acceleration (rad/s^2).
     pub acceleration: f64,
-    /// Dead band between encoder and load (degrees).
+    /// Dead band between motor and load (degrees) as stated for the kind; a joint has 70 to 100 %.
     pub backlash_deg: f64,
     /// From command to movement (s).
     pub latency: f64,

@@ -104,6 +104,6 @@ impl PanTilt for SimPanTilt {
     }
 
     fn backlash(&self) -> f64 {
-        lock(&self.world).heads[self.side as usize].servos[0].backlash()
+        lock(&self.world).heads[self.side as usize].servos[0].stated_backlash()
     }
 }

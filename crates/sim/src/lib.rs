@@ -34,7 +34,7 @@ pub use error::SimError;
 pub use stereo_scene::{StereoScene, stereo_scene};
 pub use vergence_link::HciLink;
 pub use wired::{WiredWorkcell, fitting_servo};
-pub use workcell::{TrueCamera, TrueObject, Truth, Workcell, embedded_files, settings};
+pub use workcell::{ArmPart, TrueCamera, TrueObject, Truth, Workcell, embedded_files, settings};
 
 /// The embedded robot's description.
 pub const EMBEDDED_URDF: &str = include_str!("../assets/workcell.urdf");

@@ -1,17 +1,28 @@
 //! A servo: trapezoidal moves in steps of the encoder, latency, backlash.
 //!
-//! The motor follows a trapezoidal speed profile to the nearest encoder step. The load (the camera)
-//! hangs on it with play: it stays where it is until the motor has taken up the dead band, so that
-//! its angle depends on the side it came from.
+//! The motor follows a trapezoidal speed profile into the encoder step nearest to the goal and stops
+//! somewhere within it: the controller knows no better, and the reading is that step's middle. A
+//! command into the step where the motor rests moves nothing. The load (the camera) hangs on the
+//! motor with play: it stays where it is until the motor has taken up the dead band, so that its
+//! angle depends on the side it came from. A servo's own dead band is no larger than its kind's.
+
+use rand::RngExt;
+use rand_pcg::Pcg64Mcg;
 
 use crate::config::ServoSettings;
 
+/// A servo's own slack as a share of what its maker states for the kind.
+const OWN_SLACK: std::ops::RangeInclusive<f64> = 0.7..=1.0;
+
 /// One axis.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone)]
 pub struct Servo {
     resolution: f64,
     acceleration: f64,
+    /// What the maker states; and this one's own.
+    stated_backlash: f64,
     backlash: f64,
+    rng: Pcg64Mcg,
     latency: f64,
     /// Speed limit of the joint, and that of the move under way (rad/s).
     limit: f64,
@@ -29,12 +40,15 @@ pub struct Servo {
 }
 
 impl Servo {
-    /// At rest at zero. `speed` is the joint's limit (rad/s).
-    pub fn new(settings: &ServoSettings, speed: f64) -> Self {
+    /// At rest at zero. `speed` is the joint's limit (rad/s); `rng` decides where in a step it stops.
+    pub fn new(settings: &ServoSettings, speed: f64, mut rng: Pcg64Mcg) -> Self {
+        let stated_backlash = settings.backlash_deg.to_radians();
         Servo {
             resolution: settings.resolution_deg.to_radians(),
             acceleration: settings.acceleration,
-            backlash: settings.backlash_deg.to_radians(),
+            stated_backlash,
+            backlash: stated_backlash * rng.random_range(OWN_SLACK),
+            rng,
             latency: settings.latency,
             limit: speed.max(1e-3),
             speed: speed.max(1e-3),
@@ -55,8 +69,7 @@ impl Servo {
 
     /// Commands an angle and a speed (rad/s) at time `now` (s).
     pub fn drive(&mut self, now: f64, goal: f64, speed: f64) {
-        let step = (goal / self.resolution).round() * self.resolution;
-        self.pending.push((now + self.latency, step, speed.clamp(1e-3, self.limit)));
+        self.pending.push((now + self.latency, goal, speed.clamp(1e-3, self.limit)));
     }
 
     /// Stops where it is: without torque nothing moves, the gears hold the camera.
@@ -69,11 +82,21 @@ impl Servo {
     pub fn advance(&mut self, time: f64) {
         while let Some(&(at, goal, speed)) = self.pending.first().filter(|p| p.0 <= time) {
             self.settle(at.max(self.time));
-            (self.from, self.to, self.began) = (self.motor, goal, at);
+            let to = self.rest(goal);
+            (self.from, self.to, self.began) = (self.motor, to, at);
             self.speed = speed;
             self.pending.remove(0);
         }
         self.settle(time);
+    }
+
+    /// Where a move to `goal` ends: anywhere within the encoder's step, where it is when it is there.
+    fn rest(&mut self, goal: f64) -> f64 {
+        let step = (goal / self.resolution).round();
+        if step == (self.motor / self.resolution).round() && self.motor == self.to {
+            return self.motor;
+        }
+        (step + self.rng.random_range(-0.499..0.499)) * self.resolution
     }
 
     fn settle(&mut self, time: f64) {
@@ -121,9 +144,9 @@ impl Servo {
         self.load
     }
 
-    /// Dead band (rad).
-    pub fn backlash(&self) -> f64 {
-        self.backlash
+    /// Dead band that the maker states (rad).
+    pub fn stated_backlash(&self) -> f64 {
+        self.stated_backlash
     }
 
     /// Encoder step (rad).
@@ -137,7 +160,7 @@ mod tests {
     use super::*;
 
     fn servo() -> Servo {
-        Servo::new(&ServoSettings::default(), 3.6)
+        Servo::new(&ServoSettings::default(), 3.6, crate::noise::stream(1, "servo", 0))
     }
 
     #[test]
@@ -147,7 +170,12 @@ mod tests {
         servo.advance(2.0);
         let steps = servo.encoder() / 0.35f64.to_radians();
         assert!((steps - steps.round()).abs() < 1e-9 && (servo.encoder() - 0.1).abs() < 0.0031);
-        assert_eq!(servo.motor, servo.encoder(), "rests on the step");
+        let within = (servo.motor - servo.encoder()) / 0.35f64.to_radians();
+        assert!(within.abs() < 0.5 && within != 0.0, "rests somewhere within the step: {within}");
+        let there = servo.motor;
+        servo.command(2.0, 0.1);
+        servo.advance(3.0);
+        assert_eq!(servo.motor, there, "a command into the same step moves nothing");
         assert!(!servo.moving());
     }
 
@@ -166,7 +194,7 @@ mod tests {
         }
         assert!(fastest <= 3.6 + 1e-6 && fastest > 3.5, "fastest {fastest}");
         // 1 rad at 3.6 rad/s and 40 rad/s^2: 0.278 s of cruise and 0.09 s of ramps.
-        let mut again = super::Servo::new(&ServoSettings::default(), 3.6);
+        let mut again = self::servo();
         again.command(0.0, 1.0);
         again.advance(0.008 + 0.36);
         assert!(again.moving());
@@ -180,9 +208,10 @@ mod tests {
         let arrive = |servo: &mut Servo, at: f64, goal: f64| {
             servo.command(at, goal);
             servo.advance(at + 1.0);
-            servo.load() - servo.encoder()
+            servo.load() - servo.motor
         };
-        let half = 0.075f64.to_radians();
+        let half = 0.5 * servo.backlash;
+        assert!(half > 0.052f64.to_radians() && half < 0.0751f64.to_radians());
         let step = 0.35f64.to_radians();
         assert!((arrive(&mut servo, 0.0, 20.0 * step) + half).abs() < 1e-12);
         assert!((arrive(&mut servo, 2.0, 40.0 * step) + half).abs() < 1e-12);

@@ -7,14 +7,15 @@ use std::path::Path;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use nalgebra::{Point3, Unit, UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, Point3, Rotation3, Unit, UnitQuaternion, Vector3};
 use rand::RngExt;
 use vergence_devices::{Clock, Config, Description, Head, Robot, Side};
-use vergence_geometry::{Camera as Lens, Chain, Transform};
+use vergence_geometry::{Camera as Lens, Chain, Solid, Transform};
+use vergence_imaging::Image;
 use vergence_link::HciLink;
-use vergence_tag::{Pattern, pattern::Bits};
+use vergence_tag::{Pattern, Record, pattern::Bits};
 
-use crate::camera::{Blinker, Sensor};
+use crate::camera::{Blinker, Capture, Sensor};
 use crate::config::{GeometryError, Scenario, SimConfig};
 use crate::devices::{SimCamera, SimClock, SimPanTilt};
 use crate::error::SimError;
@@ -22,8 +23,9 @@ use crate::lights::Play;
 use crate::noise::{normal, stream};
 use crate::placement::{RestView, compose};
 use crate::radio::{self, Radio};
+use crate::scene::{Body, Material};
 use crate::servo::Servo;
-use crate::trace::Stage;
+use crate::trace::{self, Stage, Texture};
 use crate::world::{Shared, Shutter, TrueHead, World, lock};
 use crate::{EMBEDDED_CONFIG, EMBEDDED_URDF};
 
@@ -43,6 +45,8 @@ pub struct Truth {
     pub objects: Vec<TrueObject>,
     /// Left and right camera as they are now.
     pub cameras: [TrueCamera; 2],
+    /// Untagged things on the table: place and form, cups and cones as the cylinder around them.
+    pub clutter: Vec<(Transform, Solid)>,
 }
 
 /// A tagged object as it stands.
@@ -50,6 +54,8 @@ pub struct Truth {
 pub struct TrueObject {
     /// Its identifier.
     pub id: String,
+    /// Its record, as its tag tells it.
+    pub record: Record,
     /// Its pose.
     pub base_from_object: Transform,
     /// Its LEDs (base frame).
@@ -131,6 +137,9 @@ impl Workcell {
         let world = World {
             heads: [left, right],
             objects: composition.objects,
+            bodies_of: composition.bodies_of,
+            without_arm: composition.scene.bodies.len(),
+            clutter: composition.clutter,
             radio,
             status,
             stage: Arc::new(Stage::new(composition.scene)),
@@ -153,7 +162,13 @@ impl Workcell {
                 pan_tilt: Box::new(SimPanTilt { world, side }),
             }
         };
-        Robot { clock: self.clock(), heads: Side::BOTH.map(head), radio: Box::new(self.radio()) }
+        Robot {
+            clock: self.clock(),
+            heads: Side::BOTH.map(head),
+            radio: Box::new(self.radio()),
+            // Contacts are simulated by another crate, which moves objects by `place_object`.
+            arm: None,
+        }
     }
 
     /// The sensor of a camera.
@@ -189,6 +204,7 @@ impl Workcell {
         let world = lock(&self.world);
         let objects = world.objects.iter().map(|object| TrueObject {
             id: object.record.object_id.to_string(),
+            record: object.record.clone(),
             base_from_object: object.base_from_object,
             landmarks: object.record.landmarks.iter().map(|site| object.landmark(site)).collect(),
         });
@@ -196,7 +212,44 @@ impl Workcell {
             let head = &world.heads[side];
             TrueCamera { lens: head.lens, base_from_optical: head.base_from_optical() }
         });
-        Truth { objects: objects.collect(), cameras }
+        let clutter = world.clutter.iter().map(|(place, solid)| (*place, solid_of(solid)));
+        Truth { objects: objects.collect(), cameras, clutter: clutter.collect() }
+    }
+
+    /// Moves a tagged object, as an arm does; pictures that are taken from now on show it there.
+    /// `false` when there is no such object.
+    pub fn place_object(&self, id: &str, base_from_object: &Transform) -> bool {
+        lock(&self.world).place_object(id, base_from_object)
+    }
+
+    /// Shows the arm's parts where they are now, in place of where they were; the cameras see them
+    /// from the next picture on.
+    pub fn show_arm(&self, parts: &[ArmPart]) {
+        lock(&self.world).show_arm(parts.iter().map(|part| {
+            let surface = Material::matt(part.albedo, Texture::Plain, 1).glossy(0.03);
+            Body::new(rendered(&part.solid), &part.base_from_solid, surface)
+        }));
+    }
+
+    /// A photograph by an onlooker who stands at `eye` and looks at `target` (base, m): for people,
+    /// no part of the robot.
+    pub fn photograph(&self, eye: &Point3<f64>, target: &Point3<f64>, lens: Lens) -> Image<u8> {
+        let ahead = Unit::new_normalize(target - eye);
+        let right = ahead.cross(&Vector3::z()).normalize();
+        let axes = [right, ahead.cross(&right), ahead.into_inner()];
+        let turn = Rotation3::from_matrix_unchecked(Matrix3::from_columns(&axes));
+        let pose = Transform::from_parts(eye.coords.into(), turn.into());
+        let world = lock(&self.world);
+        let capture = Capture {
+            sequence: 0,
+            start: world.seconds(),
+            base_from_optical: [pose; 2],
+            blinkers: Vec::new(),
+            stage: world.stage.clone(),
+        };
+        drop(world);
+        Sensor::new(lens, self.settings.camera, &self.settings.light, self.seed, 0)
+            .picture(&capture)
     }
 
     /// The wiring: what the robot knows of its cameras and joints.
@@ -212,6 +265,50 @@ impl Workcell {
     /// The simulator's settings.
     pub fn settings(&self) -> &SimConfig {
         &self.settings
+    }
+}
+
+/// A part of the arm as cameras see it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ArmPart {
+    /// Where it is.
+    pub base_from_solid: Transform,
+    /// Its form.
+    pub solid: Solid,
+    /// Share of light that it gives back.
+    pub albedo: f32,
+}
+
+/// The rendered form of a solid; a hull is shown as the box around it.
+fn rendered(solid: &Solid) -> trace::Solid {
+    let round = |radius: f64, half: f64| trace::Solid::Frustum {
+        bottom: radius as f32,
+        top: radius as f32,
+        half: half as f32,
+    };
+    match solid {
+        Solid::Cuboid { half } => trace::Solid::Box([half.x, half.y, half.z].map(|h| h as f32)),
+        Solid::Cylinder { radius, half_height } => round(*radius, *half_height),
+        Solid::Sphere { radius } => trace::Solid::Sphere(*radius as f32),
+        Solid::Convex { vertices } => {
+            let reach = |k: usize| vertices.iter().map(|v| v[k].abs()).fold(0.0, f64::max);
+            trace::Solid::Box([0, 1, 2].map(|k| reach(k) as f32))
+        }
+    }
+}
+
+/// The convex solid around a rendered one.
+fn solid_of(solid: &trace::Solid) -> Solid {
+    let cylinder = |radius: f32, half: f32| Solid::Cylinder {
+        radius: f64::from(radius),
+        half_height: f64::from(half),
+    };
+    match *solid {
+        trace::Solid::Box(half) => Solid::Cuboid { half: half.map(f64::from).into() },
+        trace::Solid::Frustum { bottom, top, half }
+        | trace::Solid::Cup { bottom, top, half, .. } => cylinder(bottom.max(top), half),
+        trace::Solid::Sphere(radius) => Solid::Sphere { radius: f64::from(radius) },
+        trace::Solid::Capsule { half, radius } => cylinder(radius, half + radius),
     }
 }
 
@@ -260,7 +357,10 @@ fn true_head(
     let stretch = 1.0 + normal(&mut rng) * focal_ratio;
     (lens.fx, lens.fy) = (lens.fx * stretch, lens.fy * stretch);
     let speed = |k: usize| chain.joints.get(k).map_or(1.0, |joint| joint.limits.velocity);
-    let servos = [0, 1].map(|k| Servo::new(&settings.servos, speed(k)));
+    let servos = [0, 1].map(|k| {
+        let rng = stream(seed, "servo", 2 * side as u64 + k as u64);
+        Servo::new(&settings.servos, speed(k), rng)
+    });
     TrueHead { chain, lens, servos }
 }
 

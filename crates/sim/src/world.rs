@@ -6,6 +6,7 @@
 //! reads which camera when.
 
 use std::collections::VecDeque;
+use std::ops::Range;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -15,8 +16,9 @@ use crate::camera::{Blinker, Capture};
 use crate::config::SimConfig;
 use crate::placement::TaggedObject;
 use crate::radio::{self, Radio};
+use crate::scene::Body;
 use crate::servo::Servo;
-use crate::trace::Stage;
+use crate::trace::{Solid, Stage};
 
 /// A head as it really is.
 #[derive(Debug, Clone)]
@@ -69,6 +71,12 @@ pub struct World {
     pub(crate) settings: SimConfig,
     pub(crate) heads: [TrueHead; 2],
     pub(crate) objects: Vec<TaggedObject>,
+    /// Which bodies of the scene belong to each object.
+    pub(crate) bodies_of: Vec<Range<usize>>,
+    /// Number of bodies of the scene that are not the arm's; those come last.
+    pub(crate) without_arm: usize,
+    /// Untagged things on the table.
+    pub(crate) clutter: Vec<(Transform, Solid)>,
     pub(crate) radio: Radio,
     pub(crate) status: Option<Blinker>,
     pub(crate) stage: Arc<Stage>,
@@ -121,6 +129,31 @@ impl World {
         }
         self.move_servos(until);
         self.now = self.now.max(time);
+    }
+
+    /// Moves a tagged object with all its bodies; frames that are complete keep what they saw.
+    pub fn place_object(&mut self, id: &str, base_from_object: &Transform) -> bool {
+        let Some(index) = self.objects.iter().position(|o| o.record.object_id.as_str() == id)
+        else {
+            return false;
+        };
+        let object = &mut self.objects[index];
+        let motion = base_from_object * object.base_from_object.inverse();
+        object.base_from_object = *base_from_object;
+        let mut scene = self.stage.scene.clone();
+        for body in scene.bodies.get_mut(self.bodies_of[index].clone()).into_iter().flatten() {
+            body.placed = body.placed.moved(&motion);
+        }
+        self.stage = Arc::new(Stage::new(scene));
+        true
+    }
+
+    /// Shows an arm, in place of the one that was shown.
+    pub fn show_arm(&mut self, parts: impl Iterator<Item = Body>) {
+        let mut scene = self.stage.scene.clone();
+        scene.bodies.truncate(self.without_arm);
+        scene.bodies.extend(parts);
+        self.stage = Arc::new(Stage::new(scene));
     }
 
     fn move_servos(&mut self, time: f64) {

@@ -1,7 +1,9 @@
 //! What happens during a run, for progress, pictures and recordings.
 
-use vergence_devices::{Advertisement, JointReading, LedCommand, Side, TagAddress};
-use vergence_geometry::GaussianPoint;
+use std::time::Duration;
+
+use vergence_devices::{Advertisement, GripperReading, JointReading, LedCommand, Side, TagAddress};
+use vergence_geometry::{GaussianPoint, Trajectory};
 use vergence_imaging::Frame;
 use vergence_landmark::Sighting;
 use vergence_pose::{ObjectPose, Query, Refusal, View};
@@ -29,6 +31,30 @@ pub enum Event<'a> {
     Centred(Side, JointReading, &'a Sighting),
     /// The triangulated landmark and the distance by equation (1) of the paper.
     Landmark(&'a GaussianPoint, f64),
+    /// The arm is about to move.
+    Motion {
+        /// When (robot's clock).
+        start: Duration,
+        /// The arm's joints.
+        names: &'a [String; 6],
+        /// What it is told.
+        trajectory: &'a Trajectory,
+    },
+    /// The arm has moved, and stands still.
+    Moved {
+        /// When it began (robot's clock).
+        start: Duration,
+        /// When it stopped: before the trajectory's end when something stopped it.
+        end: Duration,
+        /// The arm's joints.
+        names: &'a [String; 6],
+        /// What it followed until then.
+        trajectory: &'a Trajectory,
+    },
+    /// The fingers have moved.
+    Gripped(&'a GripperReading),
+    /// A stage of a grasp, worth a picture: the newest pictures show it.
+    Stage(&'static str),
     /// The recogniser has seen these views and decided.
     Recognised(&'a [View<'a>], &'a Query<'a>, Result<&'a ObjectPose, &'a Refusal>),
 }

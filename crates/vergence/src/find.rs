@@ -14,6 +14,7 @@ use vergence_geometry::{GaussianPoint, Symmetry, Transform};
 use vergence_imaging::Frame;
 use vergence_landmark::FinderError;
 use vergence_pose::{ObjectPose, Query, Refusal, View};
+use vergence_tag::signature::Verdict;
 use vergence_tag::{Pattern, Record, RecordError};
 
 use crate::event::{Event, Observer};
@@ -22,7 +23,11 @@ use crate::system::System;
 
 mod blink;
 mod centre;
+mod collect;
+mod reaim;
 mod search;
+
+pub use collect::{CollectConfig, CollectError, LightMover, Placed, Session, collect};
 
 /// Which recognition is used.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -47,6 +52,11 @@ pub struct FindConfig {
     pub link_tries: usize,
     /// Searches that are started when a light turned out not to be the tag's.
     pub search_tries: usize,
+    /// Standard deviation of the landmark's distance that is good enough (m): aiming again ends there.
+    pub depth_sigma: f64,
+    /// Most times that the heads aim again to average over the encoders' steps; the paper's method
+    /// never does.
+    pub reaims: usize,
     /// Seed for the choice of patterns.
     pub seed: u64,
 }
@@ -59,6 +69,8 @@ impl Default for FindConfig {
             link_timeout: Duration::from_secs(2),
             link_tries: 3,
             search_tries: 3,
+            depth_sigma: 0.002,
+            reaims: 16,
             seed: 0,
         }
     }
@@ -66,13 +78,15 @@ impl Default for FindConfig {
 
 /// Why a find ended without a pose.
 #[derive(Debug, thiserror::Error)]
-enum Stop {
+pub(crate) enum Stop {
     #[error("no tag of \"{object}\" answers on the radio (heard: {heard})")]
     OutOfRange { object: String, heard: String },
     #[error("{count} tags claim to be \"{object}\"")]
     Ambiguous { object: String, count: usize },
     #[error("the tag's record is not usable: {0}")]
     Record(#[from] RecordError),
+    #[error("the tag's record is refused: {0}")]
+    Signature(Verdict),
     #[error("the tag advertises \"{advertised}\" but its record says \"{recorded}\"")]
     WrongRecord { advertised: String, recorded: String },
     #[error("the tag answers, but its light was not seen in {views} views by {missing}")]
@@ -91,7 +105,7 @@ enum Stop {
 
 /// Who did not see the light.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Missing {
+pub(crate) enum Missing {
     /// Neither head did.
     Either,
     /// One did not while the other did.
@@ -109,13 +123,16 @@ impl std::fmt::Display for Missing {
 
 impl Stop {
     /// What a person can do about it.
-    fn hint(&self) -> &'static str {
+    pub(crate) fn hint(&self) -> &'static str {
         match self {
             Stop::OutOfRange { .. } => {
                 "move the robot closer, check the tag's battery and the spelling; `vergence tags` lists who answers"
             }
             Stop::Ambiguous { .. } => "switch one of the tags off, or write another id to it",
             Stop::Record(_) | Stop::WrongRecord { .. } => "write a correct record to the tag",
+            Stop::Signature(_) => {
+                "this robot wants records that are signed by a key of `trusted_keys`: `vergence tag write --sign`"
+            }
             Stop::NotSeen { .. } => {
                 "turn the object so that its landmark faces the cameras, or remove what hides it"
             }
@@ -141,8 +158,26 @@ pub fn find(
     config: &FindConfig,
     observer: &mut dyn Observer,
 ) -> Report {
-    let mut run = Run { system, config, observer, timeline: Vec::new(), landmark: None };
+    let mut run = Run::new(system, config, observer);
     let outcome = run.all(object);
+    describe(object, run, outcome.as_ref())
+}
+
+/// What a find gives to whoever acts on it.
+#[derive(Debug, Clone)]
+pub(crate) struct Found {
+    /// The pose and how sure it is.
+    pub(crate) object: ObjectPose,
+    /// The landmark (base).
+    pub(crate) landmark: GaussianPoint,
+    /// What the tag tells.
+    pub(crate) record: Record,
+    /// Whom to ask for light again.
+    pub(crate) tag: TagAddress,
+}
+
+/// The report of a run that is over.
+pub(crate) fn describe(object: &str, run: Run<'_>, outcome: Result<&Found, &Stop>) -> Report {
     let mut report = Report {
         object_id: object.into(),
         found: outcome.is_ok(),
@@ -153,15 +188,17 @@ pub fn find(
         confidence: None,
         symmetry: Symmetry::none(),
         alternatives: Vec::new(),
+        grasp: None,
         timeline: run.timeline,
         truth: None,
     };
     match outcome {
         Ok(found) => {
-            report.pose = Some(PoseReport::new(&found.pose));
-            report.confidence = Some(found.confidence);
-            report.symmetry = found.symmetry;
-            report.alternatives = found.alternatives.iter().map(alternative).collect();
+            let object = &found.object;
+            report.pose = Some(PoseReport::new(&object.pose));
+            report.confidence = Some(object.confidence);
+            report.symmetry = object.symmetry.clone();
+            report.alternatives = object.alternatives.iter().map(alternative).collect();
         }
         Err(stop) => {
             report.reason = Some(stop.to_string());
@@ -177,16 +214,37 @@ fn alternative(other: &vergence_pose::Alternative) -> AlternativeReport {
 }
 
 /// One run: what the steps share.
-struct Run<'a> {
-    system: &'a mut System,
+pub(crate) struct Run<'a> {
+    pub(crate) system: &'a mut System,
     config: &'a FindConfig,
-    observer: &'a mut dyn Observer,
+    pub(crate) observer: &'a mut dyn Observer,
     timeline: Vec<Step>,
-    landmark: Option<LandmarkReport>,
+    pub(crate) landmark: Option<LandmarkReport>,
+    /// Time between two pictures, known when the tag blinks.
+    interval: Duration,
+}
+
+impl<'a> Run<'a> {
+    /// A run in which nothing has happened yet.
+    pub(crate) fn new(
+        system: &'a mut System,
+        config: &'a FindConfig,
+        observer: &'a mut dyn Observer,
+    ) -> Self {
+        Run {
+            system,
+            config,
+            observer,
+            timeline: Vec::new(),
+            landmark: None,
+            interval: Duration::ZERO,
+        }
+    }
 }
 
 impl Run<'_> {
-    fn all(&mut self, object: &str) -> Result<ObjectPose, Stop> {
+    /// All steps of a find.
+    pub(crate) fn all(&mut self, object: &str) -> Result<Found, Stop> {
         let tag = self.step("radio", |run| run.radio(object))?;
         let record = self.step("record", |run| run.record(&tag))?;
         let pattern = self.step("blink", |run| run.start_blinking(tag.address))?;
@@ -196,7 +254,9 @@ impl Run<'_> {
         let (landmark, angles) = landmark?;
         stopped?;
         let frames = self.step("look", Self::look)?;
-        self.step("recognise", |run| run.recognise(&record, landmark, &frames, angles))
+        let object =
+            self.step("recognise", |run| run.recognise(&record, landmark, &frames, angles))?;
+        Ok(Found { object, landmark, record, tag: tag.address })
     }
 
     /// Search, centring and triangulation, while the light blinks. A light that only one head sees,
@@ -213,7 +273,7 @@ impl Run<'_> {
             if !matches!(seen, Err(Stop::NotSeen { missing: Missing::Either, .. })) {
                 pattern = self.step("challenge", |run| run.challenge(tag, pattern))?;
             }
-            match seen.and_then(|seen| self.fixate(&pattern, seen)) {
+            match seen.and_then(|seen| self.fixate(tag, &pattern, seen)) {
                 Err(
                     Stop::Lost(_)
                     | Stop::Triangulation(_)
@@ -226,14 +286,19 @@ impl Run<'_> {
         }
     }
 
+    /// Centres the light and measures where it is; gives the heads' angles too.
     fn fixate(
         &mut self,
+        tag: TagAddress,
         pattern: &Pattern,
         seen: [search::Seen; 2],
     ) -> Result<(GaussianPoint, [[f64; 2]; 2]), Stop> {
         let held = self.step("centre", |run| run.centre(pattern, seen))?;
-        let landmark = self.step("triangulate", |run| run.triangulate(&held))?;
-        Ok((landmark, held.map(|fixation| fixation.angles)))
+        let first = self.step("triangulate", |run| run.triangulate(&held))?;
+        if self.config.method == Method::Paper {
+            return Ok((first, held.map(|fixation| fixation.angles)));
+        }
+        self.step("aim again", |run| run.reaim(tag, &held, first))
     }
 
     /// Runs one step and enters its times in the timeline.
@@ -242,13 +307,23 @@ impl Run<'_> {
         name: &'static str,
         work: impl FnOnce(&mut Self) -> Result<T, Stop>,
     ) -> Result<T, Stop> {
-        let start = self.now();
-        self.observer.notice(&Event::Begun(name));
+        let start = self.begin(name);
         let outcome = work(self);
+        self.end(name, start);
+        outcome
+    }
+
+    /// Tells that a step begins; gives the time (s).
+    pub(crate) fn begin(&mut self, name: &'static str) -> f64 {
+        self.observer.notice(&Event::Begun(name));
+        self.now()
+    }
+
+    /// Enters a step that is over in the timeline.
+    pub(crate) fn end(&mut self, name: &'static str, start: f64) {
         let step = Step { step: name, start, end: self.now() };
         self.observer.notice(&Event::Done(&step));
         self.timeline.push(step);
-        outcome
     }
 
     fn now(&self) -> f64 {
@@ -275,6 +350,10 @@ impl Run<'_> {
     fn record(&mut self, tag: &Advertisement) -> Result<Record, Stop> {
         let timeout = self.config.link_timeout;
         let bytes = self.retry(|radio| radio.read_record(tag.address, timeout))?;
+        let verdict = self.system.required_signers.as_ref().map(|keys| keys.judge(&bytes));
+        if let Some(verdict) = verdict.filter(|verdict| !matches!(verdict, Verdict::Trusted(_))) {
+            return Err(Stop::Signature(verdict));
+        }
         let record = vergence_tag::cbor::decode(&bytes)?;
         if record.object_id.as_str() != tag.object_id {
             let (advertised, recorded) = (tag.object_id.clone(), record.object_id.to_string());
@@ -284,7 +363,7 @@ impl Run<'_> {
         Ok(record)
     }
 
-    fn command(&mut self, tag: TagAddress, command: LedCommand) -> Result<(), Stop> {
+    pub(crate) fn command(&mut self, tag: TagAddress, command: LedCommand) -> Result<(), Stop> {
         let timeout = self.config.link_timeout;
         self.retry(|radio| radio.command(tag, command, timeout))?;
         self.observer.notice(&Event::Led(command));
@@ -310,7 +389,7 @@ impl Run<'_> {
     }
 
     /// One picture of either camera with the light off.
-    fn look(&mut self) -> Result<[Frame; 2], Stop> {
+    pub(crate) fn look(&mut self) -> Result<[Frame; 2], Stop> {
         let since = self.system.robot.clock.now();
         let joints = self.system.joints()?;
         let left = self.system.frame_since(0, since)?;
@@ -321,7 +400,7 @@ impl Run<'_> {
     }
 
     /// Steps 4 to 9 of the paper: the object's pose from both pictures, its size and the landmark.
-    fn recognise(
+    pub(crate) fn recognise(
         &mut self,
         record: &Record,
         landmark: GaussianPoint,

@@ -32,11 +32,71 @@ pub struct Report {
     pub symmetry: Symmetry,
     /// Other poses that explain the pictures less well, best first.
     pub alternatives: Vec<AlternativeReport>,
+    /// What came of the grasp, when one was asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub grasp: Option<GraspReport>,
     /// What was done when, on the robot's clock.
     pub timeline: Vec<Step>,
     /// The simulator's truth; never present with real devices.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub truth: Option<TruthReport>,
+}
+
+/// What came of a grasp.
+#[derive(Debug, Clone, PartialEq, Default, Serialize)]
+pub struct GraspReport {
+    /// The object is in the hand, and the heads have seen that it was lifted.
+    pub succeeded: bool,
+    /// Why not, in a sentence.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub reason: Option<String>,
+    /// What a person can do about it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub hint: Option<&'static str>,
+    /// How it is held: "faces", "side", "top", "rim".
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub approach: Option<&'static str>,
+    /// What is to be between the fingers (m).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub width: Option<f64>,
+    /// Force of the fingers (N).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub force: Option<f64>,
+    /// How many times over the grasp bears the pose's doubt (95 %); at least 1.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub margin: Option<f64>,
+    /// How far the second look moved the grasp (mm).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub corrected_by_mm: Option<f64>,
+    /// What was between the fingers when they had closed (m).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub closed_width: Option<f64>,
+    /// Part of the arm that touched something on its way.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub contact: Option<String>,
+    /// After the lift the landmark was seen where the hand must have carried it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub verified: Option<bool>,
+    /// What really happened, in simulation only.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub physics: Option<PhysicsReport>,
+}
+
+/// The simulator's verdict on a grasp; never present with real devices.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct PhysicsReport {
+    /// The object is up and whole and nothing was bumped into.
+    pub lifted: bool,
+    /// How far it rose (mm).
+    pub risen_mm: f64,
+    /// It was squeezed harder than it bears.
+    pub broken: bool,
+    /// What the arm bumped into before the fingers closed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub collision: Option<String>,
+    /// How far closing the fingers shifted the object (mm).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub closing_error_mm: Option<f64>,
 }
 
 /// The triangulated landmark.

@@ -8,6 +8,7 @@ use vergence_devices::{
 };
 use vergence_head::PanTiltHead;
 use vergence_imaging::Frame;
+use vergence_tag::signature::TrustedKeys;
 
 /// How often moving servos are asked whether they are still.
 const POLL: Duration = Duration::from_millis(10);
@@ -29,6 +30,12 @@ pub enum SystemError {
         /// What is wrong.
         source: DescriptionError,
     },
+    /// The URDF's arm or gripper lacks something.
+    #[error("arm: {0}")]
+    Arm(#[from] DescriptionError),
+    /// The arm is of a kind that the planner does not know.
+    #[error("arm: {0}")]
+    Kind(#[from] vergence_grasp::RobotError),
 }
 
 /// A robot: devices and geometry.
@@ -37,6 +44,32 @@ pub struct System {
     pub robot: Robot,
     /// Left and right head: kinematics in the base frame and the camera's lens.
     pub heads: [PanTiltHead; 2],
+    /// Whose signature a record must bear; without, unsigned records do as well.
+    pub required_signers: Option<TrustedKeys>,
+    /// The arm's geometry for the planner, on robots that have an arm.
+    pub hand: Option<Hand>,
+}
+
+/// What the robot knows of its arm and gripper.
+#[derive(Clone)]
+pub struct Hand {
+    /// Kinematics, solids and gripper.
+    pub robot: vergence_grasp::Robot,
+}
+
+/// The links that every description of an arm has.
+const ARM_LINKS: [&str; 3] = ["base", "tcp", "hand"];
+
+impl Hand {
+    /// Reads the links `tcp` and `hand` of a description.
+    pub fn read(description: &Description) -> Result<Self, SystemError> {
+        let [base, tcp, hand] = ARM_LINKS;
+        let chain = description.chain(base, tcp)?;
+        let bodies = description.bodies(base, &chain)?;
+        let gripper = description.gripper(hand)?;
+        let robot = vergence_grasp::Robot::new(chain, &bodies, gripper.travel, gripper.effort)?;
+        Ok(Hand { robot })
+    }
 }
 
 impl System {
@@ -54,7 +87,9 @@ impl System {
                 .map(|chain| PanTiltHead { chain, camera: wiring.camera.model() })
                 .map_err(|source| SystemError::Description { side: side.name(), source })
         };
-        Ok(System { robot, heads: [head(Side::Left)?, head(Side::Right)?] })
+        let hand = robot.arm.is_some().then(|| Hand::read(description)).transpose()?;
+        let heads = [head(Side::Left)?, head(Side::Right)?];
+        Ok(System { robot, heads, required_signers: None, hand })
     }
 
     /// Reads the encoders of both heads.
@@ -73,7 +108,8 @@ impl System {
         for ((head, target), (geometry, from)) in
             self.robot.heads.iter_mut().zip(targets).zip(self.heads.iter().zip(before))
         {
-            let Some([pan, tilt]) = target else { continue };
+            // A reading may lie beyond the limit by half a step; nobody can be sent back there.
+            let Some([pan, tilt]) = target.map(|angles| geometry.clamp(angles)) else { continue };
             head.pan_tilt.move_to(pan, tilt)?;
             for (joint, turn) in
                 geometry.chain.joints.iter().zip([pan - from.pan, tilt - from.tilt])

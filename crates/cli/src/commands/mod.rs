@@ -2,9 +2,11 @@
 //! variant of [`Command`] and a line in [`run`].
 
 mod blink;
+mod calibrate;
 mod evaluate;
 mod experiment;
 mod find;
+mod grasp;
 mod pose;
 mod sim;
 mod tag;
@@ -20,6 +22,8 @@ use crate::failure::Failure;
 pub enum Command {
     /// Find an object and recognise its pose.
     Find(find::Find),
+    /// Find an object, grasp it and lift it.
+    Grasp(grasp::Grasp),
     /// List the tags in radio range with their records.
     Tags(tags::Tags),
     /// Work on one tag: write its record, blink its light, pair with it, ask what it is.
@@ -30,6 +34,8 @@ pub enum Command {
     Evaluate(evaluate::Evaluate),
     /// Write the built-in workcell to a folder, to edit and use with --config.
     Workcell(workcell::Workcell),
+    /// Calibrate the heads from a blinking light.
+    Calibrate(calibrate::Calibrate),
     /// Offer the simulated workcell's devices over the wires of real ones.
     Sim(sim::Sim),
     /// Find blinking landmarks in a recording.
@@ -42,11 +48,13 @@ pub enum Command {
 pub fn run(command: Command) -> Result<bool, Failure> {
     match command {
         Command::Find(args) => find::run(&args),
+        Command::Grasp(args) => grasp::run(&args),
         Command::Tags(args) => tags::run(&args),
         Command::Tag(args) => tag::run(&args),
         Command::Experiment(args) => experiment::run(&args),
         Command::Evaluate(args) => evaluate::run(args),
         Command::Workcell(args) => workcell::run(&args),
+        Command::Calibrate(args) => calibrate::run(&args),
         Command::Sim(args) => sim::run(&args),
         Command::Blink(args) => blink::run(args),
         Command::Pose(args) => pose::run(args),

@@ -35,6 +35,8 @@ const MOST_FRAMES: usize = 400;
 pub struct Saver {
     dir: PathBuf,
     recorder: Recorder,
+    /// The newest frames.
+    newest: [Option<Frame>; 2],
     /// Frames of the watch that is going on, by side.
     watched: [Vec<Frame>; 2],
     /// First thing that could not be written; reported at the end, the run goes on.
@@ -46,7 +48,13 @@ impl Saver {
     pub fn create(dir: &Path, robot: &Opened) -> Result<Self, Failure> {
         std::fs::create_dir_all(dir).map_err(|error| cannot_write(dir, error))?;
         let recorder = Recorder::create(&dir.join("recording.mcap"), robot)?;
-        Ok(Saver { dir: dir.into(), recorder, watched: Default::default(), failed: None })
+        Ok(Saver {
+            dir: dir.into(),
+            recorder,
+            newest: [None, None],
+            watched: Default::default(),
+            failed: None,
+        })
     }
 
     /// Closes the recording and writes the result; the first failure of the run, if there was one.
@@ -72,7 +80,18 @@ impl Saver {
 
     fn saw(&mut self, event: &Event<'_>) {
         match event {
+            // Each step's pictures are explained by themselves.
+            Event::Begun(_) => self.watched = Default::default(),
+            Event::Stage(stage) => {
+                for side in Side::BOTH {
+                    if let Some(frame) = &self.newest[side as usize] {
+                        let canvas = Canvas::from_gray(&frame.image, SCALE);
+                        self.picture(&format!("7-{stage}"), side, &canvas);
+                    }
+                }
+            }
             Event::Frame(side, frame, _) => {
+                self.newest[*side as usize] = Some((*frame).clone());
                 let frames = &mut self.watched[*side as usize];
                 if frames.len() < MOST_FRAMES {
                     frames.push((*frame).clone());
@@ -137,7 +156,8 @@ fn unwritten(error: CodecError) -> Failure {
     Failure::failed(error, "check the folder given with --save: is it writable, is the disk full?")
 }
 
-fn cannot_write(path: &Path, error: impl std::fmt::Display) -> Failure {
+/// What is said of a file that could not be written.
+pub fn cannot_write(path: &Path, error: impl std::fmt::Display) -> Failure {
     Failure::failed(
         format!("cannot write {}: {error}", path.display()),
         "check the folder given with --save: is it writable, is the disk full?",

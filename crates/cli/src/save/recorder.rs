@@ -3,7 +3,8 @@
 //! | topic | type |
 //! |---|---|
 //! | `/{left,right}/image_raw`, `/{left,right}/camera_info` | `sensor_msgs/msg/Image`, `CameraInfo` |
-//! | `/joint_states` | `sensor_msgs/msg/JointState` |
+//! | `/joint_states` | `sensor_msgs/msg/JointState` of heads, arm and fingers |
+//! | `/arm/joint_trajectory` | `trajectory_msgs/msg/JointTrajectory`, as the arm is told |
 //! | `/tf`, `/tf_static` | `tf2_msgs/msg/TFMessage` |
 //! | `/robot_description` | `std_msgs/msg/String` |
 //! | `/landmark`, `/object_pose` | `geometry_msgs/msg/PoseWithCovarianceStamped` in `base` |
@@ -14,7 +15,7 @@ use std::time::Duration;
 
 use vergence::{Event, Report};
 use vergence_devices::{JointReading, Side};
-use vergence_geometry::{Camera, Transform};
+use vergence_geometry::{Camera, Trajectory, Transform};
 use vergence_imaging::Frame;
 use vergence_ros::msg::std_msgs;
 use vergence_ros::msg::tf2_msgs::TFMessage;
@@ -24,6 +25,10 @@ use vergence_ros::{convert, tf};
 use crate::failure::Failure;
 use crate::robot::Opened;
 
+/// Time between two joint states of a moving arm.
+const PERIOD: Duration = Duration::from_millis(100);
+/// The link that carries the fingers.
+const HAND: &str = "hand";
 /// The frame of results.
 const BASE: &str = "base";
 
@@ -82,6 +87,20 @@ impl Recorder {
                 let message = convert::point_with_covariance(point, self.now, BASE);
                 writer.write("/landmark", self.now, &message)
             }
+            Event::Motion { start, names, trajectory } => {
+                self.now = self.now.max(*start);
+                let message = convert::joint_trajectory(trajectory, names, *start);
+                writer.write("/arm/joint_trajectory", self.now, &message)
+            }
+            Event::Moved { start, end, names, trajectory } => {
+                self.motion(writer, [*start, *end], names, trajectory)
+            }
+            Event::Gripped(reading) => {
+                let Ok(joints) = self.description.gripper(HAND) else { return Ok(()) };
+                let [a, b] = &joints.names;
+                let way = 0.5 * reading.width;
+                self.joints(writer, reading.stamp, &[(a.as_str(), way), (b.as_str(), way)])
+            }
             Event::Recognised(_, query, Ok(object)) => {
                 let message = convert::pose_with_covariance(&object.pose, self.now, BASE);
                 writer.write("/object_pose", self.now, &message)?;
@@ -90,6 +109,40 @@ impl Recorder {
             }
             _ => Ok(()),
         }
+    }
+
+    /// Where the arm was from start to end.
+    fn motion(
+        &mut self,
+        writer: &mut Writer,
+        [start, end]: [Duration; 2],
+        names: &[String; 6],
+        trajectory: &Trajectory,
+    ) -> Result<(), RecordingError> {
+        let mut stamp = start;
+        loop {
+            let Some(point) = trajectory.at((stamp - start).as_secs_f64()) else { return Ok(()) };
+            let positions: [(&str, f64); 6] =
+                std::array::from_fn(|k| (names[k].as_str(), point.positions[k]));
+            self.joints(writer, stamp, &positions)?;
+            if stamp >= end {
+                return Ok(());
+            }
+            stamp = (stamp + PERIOD).min(end);
+        }
+    }
+
+    /// Joint states with the frames that they move.
+    fn joints(
+        &mut self,
+        writer: &mut Writer,
+        stamp: Duration,
+        positions: &[(&str, f64)],
+    ) -> Result<(), RecordingError> {
+        let stamp = stamp.max(self.now);
+        self.now = stamp;
+        writer.write("/joint_states", stamp, &convert::joint_state(stamp, positions))?;
+        writer.write("/tf", stamp, &tf::moving_frames(&self.description, stamp, positions))
     }
 
     fn frame(

@@ -28,7 +28,8 @@ use vergence_tag::cbor::{self, MAX_BYTES};
 use vergence_tag::{Command, Pattern};
 
 use crate::ears::Ears;
-use crate::job::{Answer, Fault, Outcome, TagInfo, Task};
+use crate::job::{Answer, Bond, Fault, Outcome, TagInfo, Task};
+use crate::radio::TagRadio;
 use agent::Passkeys;
 use closing::Closing;
 use fault::fault;
@@ -69,51 +70,6 @@ impl BluezLink {
         Ok(BluezLink { runtime, radio })
     }
 
-    /// What the tag tells of itself.
-    pub fn info(&mut self, tag: TagAddress, timeout: Duration) -> Result<TagInfo, DeviceError> {
-        match self.attend(tag, &Task::Info, timeout)? {
-            Answer::Info(info) => Ok(info),
-            _ => Err(wrong_answer(tag)),
-        }
-    }
-
-    /// Gives the tag a new record. It is checked here first, and by the tag once more.
-    pub fn write_record(
-        &mut self,
-        tag: TagAddress,
-        record: &[u8],
-        timeout: Duration,
-    ) -> Result<(), DeviceError> {
-        let unfit = |what: String| DeviceError::Unsupported { device: name(tag), what };
-        if record.len() > MAX_BYTES {
-            return Err(unfit(format!("a record has {MAX_BYTES} bytes at most")));
-        }
-        cbor::decode(record).map_err(|error| unfit(error.to_string()))?;
-        self.attend(tag, &Task::Write(record.to_vec()), timeout).map(drop)
-    }
-
-    /// Plays a pattern no longer than `limit`, whatever the tag's own longest time is.
-    pub fn play_for(
-        &mut self,
-        tag: TagAddress,
-        pattern: Pattern,
-        limit: Duration,
-        timeout: Duration,
-    ) -> Result<TagState, DeviceError> {
-        self.led(tag, Command::Play { pattern, limit: Some(limit) }, timeout)
-    }
-
-    /// Pairs with a tag: with the passkey that is printed on it, or ("Just Works") with none. BlueZ
-    /// keeps the bond; an older one with this tag is forgotten.
-    pub fn pair(&mut self, tag: TagAddress, passkey: Option<u32>) -> Result<(), DeviceError> {
-        self.attend(tag, &Task::Pair(passkey), PAIRING).map(drop)
-    }
-
-    /// Ends the link that is held for a tag whose light plays; the light goes out.
-    pub fn release(&mut self, tag: TagAddress) -> Result<(), DeviceError> {
-        self.attend(tag, &Task::Release, PROMPT).map(drop)
-    }
-
     fn led(
         &mut self,
         tag: TagAddress,
@@ -134,6 +90,57 @@ impl BluezLink {
     ) -> Result<Answer, DeviceError> {
         let outcome = self.runtime.block_on(self.radio.attend(tag, task, timeout));
         outcome.map_err(|fault| fault.device_error(name(tag), timeout))
+    }
+}
+
+impl TagRadio for BluezLink {
+    fn info(&mut self, tag: TagAddress, timeout: Duration) -> Result<TagInfo, DeviceError> {
+        match self.attend(tag, &Task::Info, timeout)? {
+            Answer::Info(info) => Ok(info),
+            _ => Err(wrong_answer(tag)),
+        }
+    }
+
+    fn write_record(
+        &mut self,
+        tag: TagAddress,
+        record: &[u8],
+        timeout: Duration,
+    ) -> Result<(), DeviceError> {
+        let unfit = |what: String| DeviceError::Unsupported { device: name(tag), what };
+        if record.len() > MAX_BYTES {
+            return Err(unfit(format!("a record has {MAX_BYTES} bytes at most")));
+        }
+        cbor::decode(record).map_err(|error| unfit(error.to_string()))?;
+        self.attend(tag, &Task::Write(record.to_vec()), timeout).map(drop)
+    }
+
+    fn play_for(
+        &mut self,
+        tag: TagAddress,
+        pattern: Pattern,
+        limit: Duration,
+        timeout: Duration,
+    ) -> Result<TagState, DeviceError> {
+        self.led(tag, Command::Play { pattern, limit: Some(limit) }, timeout)
+    }
+
+    /// BlueZ keeps the bond; an older one with this tag is forgotten.
+    fn pair(&mut self, tag: TagAddress, passkey: Option<u32>) -> Result<Option<Bond>, DeviceError> {
+        self.attend(tag, &Task::Pair(passkey), PAIRING).map(|_| None)
+    }
+
+    fn add_bond(&mut self, _bond: Bond) -> Result<(), DeviceError> {
+        let what = "BlueZ takes no bonds of other radios: pair again".into();
+        Err(DeviceError::Unsupported { device: self.radio.adapter.name().into(), what })
+    }
+
+    fn keeps_bonds(&self) -> bool {
+        true
+    }
+
+    fn release(&mut self, tag: TagAddress) -> Result<(), DeviceError> {
+        self.attend(tag, &Task::Release, PROMPT).map(drop)
     }
 }
 

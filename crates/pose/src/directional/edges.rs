@@ -24,8 +24,9 @@ pub struct Edgel {
 pub fn edgels(level: &Level) -> Vec<Edgel> {
     let (width, height) = (level.width(), level.height());
     let threshold2 = (NOISE_FACTOR * level.noise).powi(2);
-    let magnitude: Vec<f32> =
-        level.gx.data().iter().zip(level.gy.data()).map(|(gx, gy)| gx * gx + gy * gy).collect();
+    let (gx, gy) = level.slopes();
+    let (gx, gy) = (gx.data(), gy.data());
+    let magnitude: Vec<f32> = gx.iter().zip(gy).map(|(gx, gy)| gx * gx + gy * gy).collect();
     let mut out = Vec::new();
     for y in 1..height.saturating_sub(1) {
         for x in 1..width.saturating_sub(1) {
@@ -34,7 +35,7 @@ pub fn edgels(level: &Level) -> Vec<Edgel> {
             if m <= threshold2 {
                 continue;
             }
-            let (gx, gy) = (level.gx.data()[i], level.gy.data()[i]);
+            let (gx, gy) = (gx[i], gy[i]);
             if is_ridge(&magnitude, width, i, gx, gy) {
                 let direction = gx.atan2(-gy).rem_euclid(std::f32::consts::PI);
                 out.push(Edgel { x: x as u16, y: y as u16, direction });

@@ -9,7 +9,7 @@ use vergence_imaging::{Image, kernel};
 
 /// Standard deviation of the smoothing before the derivative (px of the level): wide enough to
 /// average noise, narrow enough to keep edges two pixels apart.
-const SMOOTHING_PX: f32 = 0.9;
+const SMOOTHING_PX: f32 = 0.7;
 /// A gradient's noise is never taken to be lower (grey levels per pixel): quantisation.
 const NOISE_FLOOR: f32 = 0.12;
 
@@ -46,11 +46,9 @@ pub struct Level {
     pub scale: usize,
     /// Picture pixel of the region's top-left pixel (its own top-left corner pixel).
     pub origin: (usize, usize),
-    /// Derivative along columns (grey levels per level pixel).
-    pub gx: Image<f32>,
-    /// Derivative along rows.
-    pub gy: Image<f32>,
-    /// Standard deviation of either derivative where there is nothing but noise.
+    /// The smoothed picture (grey levels).
+    pub smooth: Image<f32>,
+    /// Standard deviation of a derivative of it (grey levels per level pixel) where there is nothing but noise.
     pub noise: f32,
 }
 
@@ -60,27 +58,25 @@ impl Level {
         let reduced = reduce(image, region, scale);
         let noise = grey_noise(&reduced);
         let smooth = kernel::gaussian_blur(&reduced, SMOOTHING_PX);
-        let (gx, gy) = slopes(&smooth);
         // White noise of deviation s through a Gaussian derivative: s / (sqrt(8 pi) sigma^2), and
         // the central difference smooths a little more.
         let gain = 1.0 / ((8.0 * std::f32::consts::PI).sqrt() * (SMOOTHING_PX.powi(2) + 0.15));
         Level {
             scale,
             origin: (region.left, region.top),
-            gx,
-            gy,
+            smooth,
             noise: (noise * gain).max(NOISE_FLOOR),
         }
     }
 
     /// Columns of the level.
     pub fn width(&self) -> usize {
-        self.gx.width()
+        self.smooth.width()
     }
 
     /// Rows of the level.
     pub fn height(&self) -> usize {
-        self.gx.height()
+        self.smooth.height()
     }
 
     /// Level coordinates of a picture pixel: both count from pixel centres.
@@ -94,17 +90,20 @@ impl Level {
         x >= 1.0 && y >= 1.0 && x < self.width() as f64 - 2.0 && y < self.height() as f64 - 2.0
     }
 
-    /// Derivative along a unit direction at a position that [`Level::contains`].
-    pub fn slope(&self, x: f64, y: f64, nx: f32, ny: f32) -> f32 {
+    /// Smoothed grey value at a position that [`Level::contains`].
+    pub fn value(&self, x: f64, y: f64) -> f32 {
         let (x0, y0) = (x as usize, y as usize);
         let (fx, fy) = ((x - x0 as f64) as f32, (y - y0 as f64) as f32);
         let i = y0 * self.width() + x0;
-        let j = i + self.width();
-        let (gx, gy) = (self.gx.data(), self.gy.data());
-        let at = |i: usize| gx[i] * nx + gy[i] * ny;
-        let top = at(i) + fx * (at(i + 1) - at(i));
-        let bottom = at(j) + fx * (at(j + 1) - at(j));
+        let [top, bottom] = [i, i + self.width()].map(|i| &self.smooth.data()[i..i + 2]);
+        let (top, bottom) =
+            (top[0] + fx * (top[1] - top[0]), bottom[0] + fx * (bottom[1] - bottom[0]));
         top + fy * (bottom - top)
+    }
+
+    /// Derivatives along columns and rows: central differences, zero on the border.
+    pub fn slopes(&self) -> (Image<f32>, Image<f32>) {
+        slopes(&self.smooth)
     }
 }
 

@@ -11,19 +11,22 @@
 //! are eliminated view by view (Schur complement). The foot of a standing object, where the shadow
 //! begins, is measured only coarsely.
 
-use nalgebra::{
-    Matrix3, Matrix4, Matrix6, Point3, RowVector4, SMatrix, SVector, Vector2, Vector3, Vector4,
-};
+use nalgebra::{Matrix3, Matrix6, Point3, RowVector4, SMatrix, SVector, Vector2, Vector3, Vector4};
 use vergence_geometry::Transform;
 use vergence_geometry::gaussian::{perturb, skew};
 
+use super::equations::{Equations, Move};
 use super::search::Search;
 use super::sites::{Layout, Nuisance, Site, State, sites};
 use crate::model::Kind;
 
 /// Standard deviation of an edge's place once the pose is right (px): aliasing, gamma, blooming and
 /// bent edges, not only noise.
-pub const EDGE_SD_PX: f64 = 0.3;
+pub const EDGE_SD_PX: f64 = 0.2;
+/// The covariance takes the deviations of what sites have in common this much larger than the
+/// estimate does: the estimate is best with the core of their distribution, the covariance has to
+/// hold its tails (their root mean square is about twice the core, docs/pose.md).
+const DOUBT: f64 = 2.0;
 /// Neighbouring sites err alike: contour length that counts as one independent measurement, in the
 /// picture (px; blur and aliasing) and on the object (m; bent edges, shadows, lines of print).
 const CORRELATION_PX: f64 = 5.0;
@@ -43,15 +46,13 @@ pub fn absence(kind: Kind) -> f64 {
     }
 }
 
+/// Deviation of the light's place on the object from the record's (m): tags are stuck on by hand.
+const PLACE_SD: f64 = 0.001;
 /// Deviation of the pixel where a camera saw the landmark, lobe and housing included (px).
 const LANDMARK_SD_PX: f64 = 0.3;
-/// Deviation of an object's true form from its record (m): rounded edges, seams, bulging sides.
-const FORM_SD: f64 = 0.0006;
 /// Thickness of the lip of an open rim (m), and its deviation.
 const LIP: f64 = 0.003;
 const LIP_SD: f64 = 0.0015;
-/// Deviation of the foot's edge (m): contact shadows hide where the object ends.
-const CONTACT_SD: f64 = 0.002;
 /// Deviation of the swelling of silhouettes (px).
 const SWELL_SD_PX: f64 = 0.4;
 /// Deviation of the logarithm of the object's size: one percent.
@@ -59,8 +60,7 @@ const SIZE_SD: f64 = 0.01;
 
 /// Deviation (px) of a site's edge when a pass works with `sd_px`.
 pub fn deviation(site: &Site, sd_px: f64) -> f64 {
-    let form = if site.contact { CONTACT_SD } else { FORM_SD };
-    sd_px.hypot(form * site.px_per_metre)
+    sd_px.hypot(site.offset_sd() * site.px_per_metre)
 }
 
 /// What holds against an attitude in which nothing can rest, where gravity is known (nats): objects
@@ -83,9 +83,12 @@ pub struct Pass {
     pub fine: bool,
 }
 
+/// The last pass: full resolution, tight.
+pub const FINAL: Pass = Pass::new(EDGE_SD_PX, 4.0, 2.0, true);
+
 impl Pass {
     /// A pass from its numbers: deviation, range to either side, spacing of sites (picture px).
-    pub fn new(sd_px: f64, range_px: f64, spacing_px: f64, fine: bool) -> Self {
+    pub const fn new(sd_px: f64, range_px: f64, spacing_px: f64, fine: bool) -> Self {
         Pass { sd_px, layout: Layout { spacing_px, range_px }, fine }
     }
 }
@@ -101,6 +104,8 @@ pub struct Refined {
     pub nuisances: Vec<Nuisance>,
     /// Covariance of the pose's tangent as the information has it.
     pub covariance: Matrix6<f64>,
+    /// How far off the parts of the object seem to be from where the record has them (m).
+    pub offsets: Vec<(u32, f64)>,
     /// What the priors hold against this state: half their squared normalised residuals.
     pub strain: f64,
     /// The hypothesis that it comes from rests on something level: it stays so while it is refined,
@@ -113,23 +118,6 @@ pub struct Refined {
 type Matrix7 = SMatrix<f64, 7, 7>;
 type Vector7 = SVector<f64, 7>;
 
-/// Sums of one view's normal equations.
-#[derive(Default, Clone)]
-struct Normal {
-    shared: Matrix7,
-    mixed: SMatrix<f64, 7, 4>,
-    own: Matrix4<f64>,
-    shared_rhs: Vector7,
-    own_rhs: Vector4<f64>,
-}
-
-/// Changes of the unknowns.
-#[derive(Clone)]
-struct Move {
-    shared: Vector7,
-    own: Vec<Vector4<f64>>,
-}
-
 impl Search<'_> {
     /// Refines a state through the given passes.
     pub fn refine(&self, refined: &mut Refined, passes: &[Pass]) {
@@ -139,13 +127,21 @@ impl Search<'_> {
             // Two steps on the same sites: the assignments settle while the geometry is linear.
             let mut moved = Move { shared: Vector7::zeros(), own: vec![Vector4::zeros(); views] };
             for _ in 0..2 {
-                let Some(step) = self.step(refined, pass, &moved) else { break };
+                let Some(step) = self.step(refined, pass, &moved, 1.0) else { break };
                 moved.shared += step.shared;
                 moved.own.iter_mut().zip(step.own).for_each(|(m, s)| *m += s);
             }
             refined.apply(&moved);
         }
         refined.strain = self.strain(refined);
+    }
+
+    /// The covariance of a refined pose, with all that sites have in common taken seriously.
+    pub fn doubt(&self, refined: &mut Refined, pass: &Pass) {
+        self.lay_out(refined, pass);
+        let views = self.sights.len();
+        let still = Move { shared: Vector7::zeros(), own: vec![Vector4::zeros(); views] };
+        self.step(refined, pass, &still, DOUBT);
     }
 
     /// Looks for the edges around a refined pose anew.
@@ -169,8 +165,8 @@ impl Search<'_> {
     }
 
     /// One Gauss-Newton step from `moved`; keeps the covariance in `refined`.
-    fn step(&self, refined: &mut Refined, pass: &Pass, moved: &Move) -> Option<Move> {
-        let mut normals = vec![Normal::default(); self.sights.len()];
+    fn step(&self, refined: &mut Refined, pass: &Pass, moved: &Move, doubt: f64) -> Option<Move> {
+        let mut equations = Equations::new(self.sights.len(), pass.sd_px, doubt);
         for site in &refined.sites {
             let own = &moved.own[site.view];
             let by_own =
@@ -178,46 +174,26 @@ impl Search<'_> {
             let shift = (site.by_pose * moved.shared).x + (by_own * own).x;
             let by_lip = site.by_nuisance.w;
             for (inner, weight, residual) in assign(site, shift, by_lip * own.w, pass.sd_px) {
-                let n = &mut normals[site.view];
-                let js = site.by_pose.transpose();
-                let jo = if inner { site.by_nuisance } else { by_own };
-                n.shared += js * weight * site.by_pose;
-                n.mixed += js * weight * jo;
-                n.own += jo.transpose() * weight * jo;
-                n.shared_rhs += js * (weight * residual);
-                n.own_rhs += jo.transpose() * (weight * residual);
+                let by_own = if inner { site.by_nuisance } else { by_own };
+                equations.edge(site, &by_own, weight, residual);
             }
         }
+        equations.share_errors(&refined.offsets);
         let mut now = refined.clone_state();
         now.apply(moved);
-        let (mut a, mut b) = self.prior(&now);
-        for (view, n) in normals.iter_mut().enumerate() {
-            let Some((residual, by_shared, by_own)) = self.landmark_pixel(&now, view) else {
-                continue;
-            };
-            let weight = LANDMARK_SD_PX.powi(-2);
-            n.shared += by_shared.transpose() * weight * by_shared;
-            n.mixed += by_shared.transpose() * weight * by_own;
-            n.own += by_own.transpose() * weight * by_own;
-            n.shared_rhs += by_shared.transpose() * weight * residual;
-            n.own_rhs += by_own.transpose() * weight * residual;
-        }
-        let mut eliminated = Vec::with_capacity(normals.len());
-        for (view, n) in normals.iter_mut().enumerate() {
+        let (a, b) = self.prior(&now);
+        equations.shared(&a, &b);
+        for view in 0..self.sights.len() {
+            if let Some((residual, by_shared, by_own)) = self.landmark_pixel(&now, view) {
+                equations.pixel(view, &by_shared, &by_own, LANDMARK_SD_PX.powi(-2), &residual);
+            }
             let precision = self.nuisance_precision(view);
-            n.own += Matrix4::from_diagonal(&precision);
-            n.own_rhs -= precision.component_mul(&(now.nuisances[view] - usual()));
-            let inverse = n.own.try_inverse()?;
-            a += n.shared - n.mixed * inverse * n.mixed.transpose();
-            b += n.shared_rhs - n.mixed * inverse * n.own_rhs;
-            eliminated.push(inverse);
+            equations.own(view, &precision, &(usual() - now.nuisances[view]));
         }
-        let factor = a.cholesky()?;
-        refined.covariance = factor.inverse().fixed_view::<6, 6>(0, 0).into_owned();
-        let shared = factor.solve(&b);
-        let own = normals.iter().zip(eliminated);
-        let own = own.map(|(n, i)| i * (n.own_rhs - n.mixed.transpose() * shared)).collect();
-        Some(Move { shared, own })
+        let solution = equations.solve()?;
+        refined.covariance = solution.covariance;
+        refined.offsets = solution.offsets;
+        Some(solution.step)
     }
 
     fn nuisance_precision(&self, view: usize) -> Vector4<f64> {
@@ -273,8 +249,9 @@ impl Search<'_> {
     }
 
     /// What the landmark's measurement is worth as a point (1/m^2).
-    fn landmark_weight(&self) -> Matrix3<f64> {
-        self.query.landmark.covariance.try_inverse().unwrap_or_default()
+    pub(super) fn landmark_weight(&self) -> Matrix3<f64> {
+        let place = Matrix3::identity() * (PLACE_SD * PLACE_SD);
+        (self.query.landmark.covariance + place).try_inverse().unwrap_or_default()
     }
 
     /// Information and right-hand side of the landmark, of gravity and of the size.
@@ -350,6 +327,7 @@ impl Refined {
             log_size: 0.0,
             nuisances: vec![usual(); views],
             covariance: Matrix6::identity(),
+            offsets: Vec::new(),
             strain: 0.0,
             sites: Vec::new(),
         }
@@ -365,7 +343,12 @@ impl Refined {
 
     /// The unknowns without the sites.
     fn clone_state(&self) -> Self {
-        Refined { sites: Vec::new(), nuisances: self.nuisances.clone(), ..*self }
+        Refined {
+            sites: Vec::new(),
+            offsets: Vec::new(),
+            nuisances: self.nuisances.clone(),
+            ..*self
+        }
     }
 }
 
@@ -382,26 +365,31 @@ fn assign(
     lip_shift: f64,
     sd: f64,
 ) -> impl Iterator<Item = (bool, f64, f64)> {
-    let sd = deviation(site, sd);
+    let common = site.offset_sd() * site.px_per_metre;
     let missing = absence(site.kind);
     let edges = if site.inner.is_some() { 2.0 } else { 1.0 };
-    let density = (1.0 - missing) / (edges * sd * (2.0 * std::f64::consts::PI).sqrt());
-    let mut sums = [(0.0, 0.0); 2];
+    let density = (1.0 - missing) / (edges * (2.0 * std::f64::consts::PI).sqrt());
+    // Likelihood, its weighted residual and its weight, for either edge.
+    let mut sums = [[0.0; 3]; 2];
     for (place, inner) in site.places() {
         let sum = &mut sums[usize::from(inner)];
         let place = if inner { place + lip_shift } else { place };
         for c in site.edges() {
             let r = c.offset - place - shift;
-            let likelihood = density * c.weight * (-0.5 * (r / sd).powi(2)).exp();
-            sum.0 += likelihood;
-            sum.1 += likelihood * r;
+            let local = sd.hypot(c.noise_px);
+            let total = local.hypot(common);
+            let likelihood = density * c.weight * (-0.5 * (r / total).powi(2)).exp() / total;
+            let weight = likelihood * sd * sd / (local * local);
+            sum[0] += likelihood;
+            sum[1] += weight * r;
+            sum[2] += weight;
         }
     }
-    let total = sums[0].0 + sums[1].0 + missing * STRAY_DENSITY;
-    let scale = independent(site) / (sd * sd * total);
+    let total = sums[0][0] + sums[1][0] + missing * STRAY_DENSITY;
+    let scale = (site.length / CORRELATION_PX).min(1.0) / total;
     [false, true]
         .into_iter()
         .zip(sums)
-        .filter(|(_, (likelihood, _))| *likelihood > 0.0)
-        .map(move |(inner, (likelihood, moment))| (inner, scale * likelihood, moment / likelihood))
+        .filter(|(_, sum)| sum[0] > 0.0)
+        .map(move |(inner, [_, moment, weight])| (inner, scale * weight, moment / weight))
 }

@@ -13,10 +13,28 @@ use super::level::Level;
 use super::search::Sight;
 use crate::model::{Contour, Kind, Model};
 
+// Deviations of a whole part's edge from where the record has it, on the object (m): the core of
+// what was measured at the true poses of rendered, simulated and real scenes (docs/pose.md).
+/// Outline where a face ends: rounded edges, seams, bulging sides.
+const FORM_SD: f64 = 0.0004;
+/// Outline of a curved wall: it darkens towards where it turns away.
+const LIMB_SD: f64 = 0.0007;
+/// Edge between two visible faces: where a rounded edge seems to be depends on the light.
+const CREASE_SD: f64 = 0.0006;
+/// Open rim: rolled or rounded lips.
+const RIM_SD: f64 = 0.0008;
+/// Foot of a standing object: contact shadows hide where it ends.
+const CONTACT_SD: f64 = 0.0015;
+
 /// Most edges kept at a site.
 pub const CANDIDATES: usize = 4;
 /// A slope counts as an edge from this many noise deviations on.
 const NOISE_FACTOR: f32 = 3.5;
+
+/// Deviation of a slope's maximum (px of the level) by noise, at a slope of one noise deviation: the
+/// noise of the second derivative against its size at the maximum of a blurred step, whose blur is
+/// the lens's, the pixel's and the level's together.
+const NOISE_TO_PLACE: f64 = 1.9;
 
 /// An edge across the contour.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -25,6 +43,8 @@ pub struct Candidate {
     pub offset: f64,
     /// Weight, 0 to 1: strength against the strongest edge of the site.
     pub weight: f64,
+    /// Deviation of the offset by sensor noise (picture px).
+    pub noise_px: f64,
     /// Contrast per pixel, signed along the normal (grey levels).
     pub slope: f32,
 }
@@ -43,12 +63,16 @@ pub type Nuisance = Vector4<f64>;
 pub struct Site {
     /// Which view.
     pub view: usize,
-    /// Which segment of the contour (counts through the view).
-    pub segment: usize,
+    /// Which part of the body the contour lies on there, as in [`crate::Segment`].
+    pub part: u16,
+    /// How far along the part (m).
+    pub along: f64,
     /// Silhouette or crease.
     pub kind: Kind,
     /// Picture pixel.
     pub pixel: (f64, f64),
+    /// The outline of a curved wall, where the surface turns away smoothly.
+    pub limb: bool,
     /// Unit normal in the picture.
     pub normal: (f64, f64),
     /// Contour length that the site stands for (picture px).
@@ -74,6 +98,17 @@ impl Site {
     /// itself, or the inner edge of a rim's lip.
     pub fn places(&self) -> impl Iterator<Item = (f64, bool)> {
         std::iter::once((0.0, false)).chain(self.inner.map(|inner| (inner, true)))
+    }
+
+    /// Deviation of the whole part's edge from where the record has it, on the object (m).
+    pub fn offset_sd(&self) -> f64 {
+        match (self.contact, self.kind) {
+            (true, _) => CONTACT_SD,
+            (false, Kind::Crease) => CREASE_SD,
+            (false, Kind::Rim) => RIM_SD,
+            (false, Kind::Silhouette) if self.limb => LIMB_SD,
+            (false, Kind::Silhouette) => FORM_SD,
+        }
     }
 
     /// The edges found.
@@ -129,7 +164,7 @@ pub fn sites(
     };
     let up_in_object = up.map(|up| pose.rotation.inverse() * up.into_inner());
     let mut profile = Vec::new();
-    for (index, segment) in contour.iter().enumerate() {
+    for segment in &contour {
         let [from, to] =
             [segment.from, segment.to].map(|p| optical_from_object * Point3::from(p * size));
         let (Some(a), Some(b)) = (camera.project(&from), camera.project(&to)) else { continue };
@@ -178,7 +213,9 @@ pub fn sites(
             };
             let mut site = Site {
                 view,
-                segment: index,
+                part: segment.part,
+                limb: segment.kind == Kind::Silhouette && segment.away.is_none(),
+                along: segment.along + share * (segment.to - segment.from).norm(),
                 kind: segment.kind,
                 pixel: (pixel.x, pixel.y),
                 normal: (normal.x, normal.y),
@@ -206,11 +243,18 @@ fn find_edges(site: &mut Site, level: &Level, range_px: f64, profile: &mut Vec<f
     let (x, y) = level.from_picture(site.pixel.0, site.pixel.1);
     let (nx, ny) = site.normal;
     let reach = (range_px / scale).ceil() as i32 + 1;
+    // Slopes as differences of values half a pixel to either side. Outside the picture: none.
     profile.clear();
+    let value = |k: i32| {
+        let offset = f64::from(k) - 0.5;
+        let (px, py) = (x + nx * offset, y + ny * offset);
+        level.contains(px, py).then(|| level.value(px, py))
+    };
+    let mut behind = value(-reach);
     for k in -reach..=reach {
-        let (px, py) = (x + nx * f64::from(k), y + ny * f64::from(k));
-        let inside = level.contains(px, py);
-        profile.push(if inside { level.slope(px, py, nx as f32, ny as f32) } else { 0.0 });
+        let ahead = value(k + 1);
+        profile.push(ahead.zip(behind).map_or(0.0, |(a, b)| a - b));
+        behind = ahead;
     }
     let threshold = NOISE_FACTOR * level.noise;
     let mut strongest = 0.0f32;
@@ -227,7 +271,9 @@ fn find_edges(site: &mut Site, level: &Level, range_px: f64, profile: &mut Vec<f
         }
         let height = b - 0.25 * (a - c) * peak;
         strongest = strongest.max(height);
-        insert(site, Candidate { offset, weight: f64::from(height), slope: sign * height });
+        let noise_px = NOISE_TO_PLACE * f64::from(level.noise / height) * scale;
+        let weight = f64::from(height);
+        insert(site, Candidate { offset, weight, noise_px, slope: sign * height });
     }
     for candidate in &mut site.candidates[..site.count] {
         candidate.weight = 0.3 + 0.7 * candidate.weight / f64::from(strongest);

@@ -137,7 +137,7 @@ impl Polyhedron {
             seen |= u128::from(face.normal.dot(eye) > face.offset) << k;
         }
         out.points.extend_from_slice(&self.vertices);
-        for edge in &self.edges {
+        for (part, edge) in self.edges.iter().enumerate() {
             let [a, b] = edge.faces.map(|f| seen >> f & 1 == 1);
             if !(a || b) {
                 continue;
@@ -147,7 +147,13 @@ impl Polyhedron {
                 true => (Kind::Crease, None),
                 false => (Kind::Silhouette, Some(self.faces[hidden].normal)),
             };
-            let line = Line { ends: edge.ends.map(|v| v as u16), kind, away };
+            let line = Line {
+                ends: edge.ends.map(|v| v as u16),
+                kind,
+                away,
+                part: part as u16,
+                along: 0.0,
+            };
             if self.convex {
                 out.lines.push(line);
             } else {
@@ -159,11 +165,13 @@ impl Polyhedron {
     fn visible_pieces(&self, eye: &Vector3<f64>, edge: &Edge, whole: Line, out: &mut Outline) {
         let [from, to] = edge.ends.map(|v| self.vertices[v]);
         let first = out.points.len();
+        let step = (to - from).norm() / PIECES as f64;
         out.points.extend((0..=PIECES).map(|k| from.lerp(&to, k as f64 / PIECES as f64)));
         for k in first..first + PIECES {
             let middle = (out.points[k] + out.points[k + 1]) / 2.0;
             if !self.hides(&middle, eye, edge) {
-                out.lines.push(Line { ends: [k as u16, k as u16 + 1], ..whole });
+                let along = step * (k - first) as f64;
+                out.lines.push(Line { ends: [k as u16, k as u16 + 1], along, ..whole });
             }
         }
     }

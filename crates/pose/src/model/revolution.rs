@@ -38,7 +38,7 @@ impl Frustum {
         self.rim(self.top, self.half_height, top_seen, towards, half, chords, out);
         self.rim(self.bottom, -self.half_height, bottom_seen, towards, half, chords, out);
         if half > 0.0 && half < TAU / 2.0 {
-            for t in [towards - half, towards + half] {
+            for (side, t) in [towards - half, towards + half].into_iter().enumerate() {
                 let (sin, cos) = t.sin_cos();
                 let first = out.points.len() as u16;
                 out.points.push(Vector3::new(self.top * cos, self.top * sin, self.half_height));
@@ -48,7 +48,8 @@ impl Frustum {
                     -self.half_height,
                 ));
                 let ends = [first, first + 1];
-                out.lines.push(Line { ends, kind: Kind::Silhouette, away: None });
+                let part = side as u16;
+                out.lines.push(Line { ends, kind: Kind::Silhouette, away: None, part, along: 0.0 });
             }
         }
     }
@@ -79,6 +80,10 @@ impl Frustum {
     }
 }
 
+/// Numbers of the rims; the wall's two sides come before.
+const TOP: u16 = 2;
+const BOTTOM: u16 = 3;
+
 fn arc(
     radius: f64,
     z: f64,
@@ -95,11 +100,13 @@ fn arc(
     let (sin, cos) = (length / n as f64).sin_cos();
     // Chords of the circle that is as far outside at the corners as inside at the middles.
     let r = radius * 2.0 / (1.0 + (length / (2.0 * n as f64)).cos());
+    let part = if z > 0.0 { TOP } else { BOTTOM };
     let mut p = Vector3::new(r * start.cos(), r * start.sin(), z);
-    for _ in 0..n {
+    for k in 0..n {
         let first = out.points.len() as u16;
         out.points.push(p);
-        out.lines.push(Line { ends: [first, first + 1], kind, away });
+        let along = radius * (start + length * k as f64 / n as f64).rem_euclid(TAU);
+        out.lines.push(Line { ends: [first, first + 1], kind, away, part, along });
         p = Vector3::new(p.x * cos - p.y * sin, p.x * sin + p.y * cos, z);
     }
     out.points.push(p);
@@ -124,7 +131,8 @@ pub(super) fn sphere_outline(radius: f64, eye: &Vector3<f64>, chords: usize, out
     out.points.extend((0..chords).map(at));
     for k in 0..chords as u16 {
         let ends = [k, (k + 1) % chords as u16];
-        out.lines.push(Line { ends, kind: Kind::Silhouette, away: None });
+        let along = r * TAU * f64::from(k) / chords as f64;
+        out.lines.push(Line { ends, kind: Kind::Silhouette, away: None, part: 0, along });
     }
 }
 

@@ -92,6 +92,17 @@ impl Placed {
         Placed { solid, rotation, centre: [c.x as f32, c.y as f32, c.z as f32], bound }
     }
 
+    /// The same solid after a motion in the base frame.
+    pub fn moved(&self, motion: &Transform) -> Self {
+        let double = |v: V3| Vector3::new(v[0], v[1], v[2]).map(f64::from);
+        let single = |v: Vector3<f64>| [v.x as f32, v.y as f32, v.z as f32];
+        Placed {
+            rotation: self.rotation.map(|axis| single(motion.rotation * double(axis))),
+            centre: single(motion.rotation * double(self.centre) + motion.translation.vector),
+            ..self.clone()
+        }
+    }
+
     /// Centre of the bounding sphere.
     pub fn centre(&self) -> V3 {
         self.centre

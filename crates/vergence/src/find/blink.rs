@@ -24,8 +24,9 @@ const LONGEST_WATCH: Duration = Duration::from_secs(6);
 
 impl Run<'_> {
     /// Chooses the pattern and has the tag play it.
-    pub(super) fn start_blinking(&mut self, tag: TagAddress) -> Result<Pattern, Stop> {
+    pub(crate) fn start_blinking(&mut self, tag: TagAddress) -> Result<Pattern, Stop> {
         let interval = self.frame_interval()?;
+        self.interval = interval;
         let rate = 1.0 / interval.as_secs_f64().max(1e-3);
         let pattern = match self.config.method {
             Method::Paper => Pattern::new(Bits::FLICKER, interval * FLICKER_FRAMES).ok(),
@@ -101,11 +102,8 @@ impl Run<'_> {
         }];
         Ok(match self.config.method {
             Method::Paper => Box::new(PaperFinder::new(requests, Default::default())?),
-            // Only this robot's tags blink by code here, and what blinks nearly alike fails the
-            // challenge: the slower test against foreign rates is not needed.
             Method::Directional => {
-                let config = sequential::Config { foreign_rate: None, ..Default::default() };
-                Box::new(SequentialFinder::new(requests, config)?)
+                Box::new(SequentialFinder::new(requests, sequential::Config::default())?)
             }
         })
     }

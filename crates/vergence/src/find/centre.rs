@@ -1,7 +1,8 @@
 //! Steps 2 and 3 of the paper: the light is brought to the centre of both pictures, and the joint
 //! angles give its place.
 
-use vergence_devices::{JointReading, Side};
+use nalgebra::Point3;
+use vergence_devices::{JointReading, Side, TagAddress};
 use vergence_geometry::GaussianPoint;
 use vergence_head::{
     Fixation, Fixator, FixatorConfig, GATE_SIGMAS, NextMove, Noise, PaperAngles, epipolar_gap,
@@ -11,7 +12,7 @@ use vergence_landmark::Sighting;
 use vergence_tag::Pattern;
 
 use super::search::Seen;
-use super::{Run, Stop};
+use super::{Missing, Run, Stop};
 use crate::event::Event;
 use crate::report::LandmarkReport;
 
@@ -58,6 +59,34 @@ impl Run<'_> {
         Ok(held.map(|(joints, sighting)| fixation(&joints, &sighting)))
     }
 
+    /// Looks at a place where the light should be, centres it and measures where it is; gives the
+    /// heads' angles too.
+    pub(crate) fn locate_near(
+        &mut self,
+        tag: TagAddress,
+        pattern: &Pattern,
+        near: &Point3<f64>,
+    ) -> Result<(GaussianPoint, [[f64; 2]; 2]), Stop> {
+        let targets = [0, 1].map(|k| self.system.heads[k].look_at(near));
+        let joints = self.system.turn(targets)?;
+        let sightings = self.watch(pattern, joints.map(Some))?;
+        let missing = [0, 1].map(|k| sightings[k].is_empty());
+        if missing != [false, false] {
+            let missing = match missing {
+                [true, true] => Missing::Either,
+                [true, false] => Missing::One(Side::Left),
+                _ => Missing::One(Side::Right),
+            };
+            return Err(Stop::NotSeen { views: 2, missing });
+        }
+        let [left, right] = sightings;
+        let seen = [
+            Seen { joints: joints[0], sightings: left },
+            Seen { joints: joints[1], sightings: right },
+        ];
+        self.fixate(tag, pattern, seen)
+    }
+
     /// Of all places that either head saw, the pair that can be one light: the brightest whose lines
     /// of sight meet, else the pair that comes nearest. Mirrors show the pattern elsewhere.
     fn same_light(&self, seen: &[Seen; 2]) -> [(JointReading, Sighting); 2] {
@@ -102,17 +131,23 @@ impl Run<'_> {
         sightings.into_iter().min_by(|a, b| distance(a).total_cmp(&distance(b)))
     }
 
-    /// The landmark in the base frame, with equation (1) of the paper beside the exact point.
+    /// The landmark in the base frame from one fixation of either head.
     pub(super) fn triangulate(&mut self, held: &[Fixation; 2]) -> Result<GaussianPoint, Stop> {
         let heads = &self.system.heads;
         let landmark = triangulate(heads, held, &self.noise())?.point;
+        self.located(&landmark, held);
+        Ok(landmark)
+    }
+
+    /// Reports where the landmark is, with equation (1) of the paper for the same angles.
+    pub(super) fn located(&mut self, landmark: &GaussianPoint, held: &[Fixation; 2]) {
+        let heads = &self.system.heads;
         let axes = [0, 1].map(|k| heads[k].chain.joints[0].parent_from_joint.translation.vector);
         let baseline = (axes[0] - axes[1]).norm();
         let angles = PaperAngles::from_pan_tilt(held[0].angles, held[1].angles);
         let distance = paper_distance(&angles, baseline).unwrap_or(f64::INFINITY);
-        self.landmark = Some(LandmarkReport::new(&landmark, distance));
-        self.observer.notice(&Event::Landmark(&landmark, distance));
-        Ok(landmark)
+        self.landmark = Some(LandmarkReport::new(landmark, distance));
+        self.observer.notice(&Event::Landmark(landmark, distance));
     }
 
     /// Angle noise of the coarser head.
@@ -128,7 +163,7 @@ impl Run<'_> {
     }
 }
 
-fn fixation(joints: &JointReading, sighting: &Sighting) -> Fixation {
+pub(super) fn fixation(joints: &JointReading, sighting: &Sighting) -> Fixation {
     Fixation {
         angles: [joints.pan, joints.tilt],
         pixel: sighting.pixel,

@@ -3,39 +3,17 @@
 //! A small box, a cup, and the cup behind an occluder are found one after the other in as many
 //! simulated workcells as there are seeds; every run is judged by the simulator's truth.
 
-use std::path::PathBuf;
-
-use clap::Args;
 use rayon::prelude::*;
 use serde::Serialize;
 use vergence::{FindConfig, Report};
 use vergence_sim::Scenario;
 
-use super::find::MethodArg;
+use super::{Experiment, quantile};
+use crate::commands::find::MethodArg;
 use crate::failure::Failure;
 use crate::progress::Progress;
 use crate::robot::{Errors, Opened};
 use crate::save::Saver;
-
-/// Run one of the paper's experiments in the simulated workcell, with statistics.
-#[derive(Args)]
-pub struct Experiment {
-    /// Which experiment.
-    #[arg(value_parser = clap::value_parser!(u8).range(1..=1))]
-    number: u8,
-    /// Number of workcells, each from a seed of its own.
-    #[arg(long, default_value_t = 10, value_parser = clap::value_parser!(u64).range(1..=100_000))]
-    seeds: u64,
-    /// Which recognition is used.
-    #[arg(long, value_enum, default_value_t)]
-    method: MethodArg,
-    /// Folder for the pictures of the paper's figure 11 (from the first seed).
-    #[arg(long, value_name = "DIR")]
-    save: Option<PathBuf>,
-    /// Print the result as JSON.
-    #[arg(long)]
-    json: bool,
-}
 
 /// What is looked for, in which scene.
 const CONDITIONS: [Condition; 3] = [
@@ -177,14 +155,6 @@ fn landmark_error_mm(report: &Report) -> Option<f64> {
     let (landmark, truth) = (report.landmark.as_ref()?, report.truth.as_ref()?);
     let squares = landmark.position.iter().zip(truth.landmark).map(|(a, b)| (a - b) * (a - b));
     Some(1e3 * squares.sum::<f64>().sqrt())
-}
-
-/// The smallest value that at least a share `q` of the values do not exceed.
-fn quantile(values: impl Iterator<Item = f64>, q: f64) -> Option<f64> {
-    let mut values: Vec<f64> = values.collect();
-    values.sort_by(f64::total_cmp);
-    let rank = (q * values.len() as f64).ceil() as usize;
-    values.get(rank.saturating_sub(1)).copied()
 }
 
 fn print(args: &Experiment, output: &Output) {

@@ -1,0 +1,248 @@
+//! `vergence calibrate`: the heads' geometry and lenses from the blinking light alone.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use nalgebra::{Point3, Vector3};
+use serde::Serialize;
+use vergence::{CollectConfig, FindConfig, Session, System};
+use vergence_devices::Side;
+use vergence_head::calibration::{Calibration, CalibrationConfig, middle};
+use vergence_head::{Noise, PanTiltHead};
+
+use crate::failure::Failure;
+use crate::light::{Person, SimulatedPerson};
+use crate::progress::Progress;
+use crate::robot::{BUILT, Opened, RobotArgs};
+
+/// Calibrate both heads from a tag's blinking light: joint zeros, axes, lever arms, lenses. The tag is
+/// moved from place to place; every second place is a known length from the one before.
+#[derive(Args)]
+pub struct Calibrate {
+    /// Wiring of the robot (TOML).
+    #[arg(long, value_name = "FILE")]
+    config: PathBuf,
+    /// Configuration to write; the calibrated URDF goes beside it.
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// Object id of the tag whose light is moved.
+    #[arg(long, default_value = "cup")]
+    object: String,
+    /// Places of the light, in pairs.
+    #[arg(long, default_value_t = 16, value_parser = clap::value_parser!(u16).range(2..=1000))]
+    places: u16,
+    /// Angles from which each head looks at each place.
+    #[arg(long, default_value_t = CollectConfig::default().views as u16, value_parser = clap::value_parser!(u16).range(4..=1000))]
+    views: u16,
+    /// Length (m) between the two places of a pair.
+    #[arg(long, default_value_t = 0.5)]
+    length: f64,
+    /// Standard deviation (m) of that length.
+    #[arg(long, default_value_t = 0.0005)]
+    length_sigma: f64,
+    /// Seed of the simulated workcell.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Print the result as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+/// What came out.
+#[derive(Serialize)]
+struct Outcome {
+    calibrated: bool,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    reason: Option<String>,
+    places: usize,
+    /// Sightings of the left and of the right head.
+    sightings: [usize; 2],
+    missed: usize,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    figures: Option<Figures>,
+}
+
+#[derive(Serialize)]
+struct Figures {
+    /// Residual of the sightings (px, rms).
+    rms_px: f64,
+    outliers: f64,
+    /// Predicted error of a distance (m): half width of the 95 % interval.
+    distance_95: Vec<DistanceError>,
+    focal_px: [f64; 2],
+}
+
+#[derive(Serialize)]
+struct DistanceError {
+    distance: f64,
+    error: f64,
+}
+
+/// Two sigmas of a normal distribution hold 95 %.
+const SIGMAS_95: f64 = 1.96;
+
+/// Runs the command.
+pub fn run(args: &Calibrate) -> Result<bool, Failure> {
+    let fits = |value: f64, high: f64| value > 0.0 && value < high;
+    if !fits(args.length, 10.0) || !fits(args.length_sigma, args.length) {
+        return Err(Failure::misuse(
+            "--length and --length-sigma are not a length and its uncertainty",
+            "give both in metres, for example --length 0.5 --length-sigma 0.0005",
+        ));
+    }
+    let robot = RobotArgs { config: Some(args.config.clone()), seed: args.seed };
+    let mut opened = robot.open()?;
+    let session = sightings(args, &mut opened)?;
+    let noise = noise(&opened.system);
+    let config = CalibrationConfig { noise, ..CalibrationConfig::default() };
+    let outcome =
+        vergence_head::calibrate(&opened.system.heads, &session.places, &session.lengths, &config);
+    let count = |k: usize| session.places.iter().map(|p| p.fixations[k].len()).sum();
+    let mut told = Outcome {
+        calibrated: outcome.is_ok(),
+        reason: outcome.as_ref().err().map(ToString::to_string),
+        places: session.places.len(),
+        sightings: [count(0), count(1)],
+        missed: session.missed,
+        figures: None,
+    };
+    if let Ok(calibration) = &outcome {
+        told.figures = Some(figures(calibration));
+        write(args, &opened, calibration)?;
+    }
+    print(args, &told)?;
+    Ok(told.calibrated)
+}
+
+/// Looks at the light wherever a person, real or simulated, puts it.
+fn sightings(args: &Calibrate, opened: &mut Opened) -> Result<Session, Failure> {
+    let config = CollectConfig {
+        views: usize::from(args.views),
+        find: FindConfig { seed: args.seed, ..FindConfig::default() },
+    };
+    let places = usize::from(args.places).next_multiple_of(2);
+    let length = (args.length, args.length_sigma);
+    let mut progress = Progress::steps();
+    let collected = match opened.simulator() {
+        Some(workcell) => {
+            let mut person =
+                SimulatedPerson::new(workcell, &args.object, places, length, args.seed);
+            vergence::collect(&mut opened.system, &args.object, &mut person, &config, &mut progress)
+        }
+        None => {
+            let mut person = Person::new(places, length);
+            // A person reads and answers: nothing may overwrite the prompt.
+            vergence::collect(&mut opened.system, &args.object, &mut person, &config, &mut ())
+        }
+    };
+    collected.map_err(|error| Failure::failed(&error, error.hint))
+}
+
+/// Encoder noise of the coarser servos; slack that always lies on one side is part of the zeros.
+fn noise(system: &System) -> Noise {
+    let steps = system.robot.heads.iter().map(|head| head.pan_tilt.resolution());
+    Noise::of_servo(steps.fold(0.0, f64::max), 0.0)
+}
+
+fn figures(calibration: &Calibration) -> Figures {
+    let from = middle(&calibration.heads);
+    let at = |distance: f64| {
+        let ahead: Point3<f64> = from + Vector3::new(0.9, 0.0, -0.4).normalize() * distance;
+        let sigma = calibration.distance_sigma(&ahead).unwrap_or(f64::INFINITY);
+        DistanceError { distance, error: SIGMAS_95 * sigma }
+    };
+    Figures {
+        rms_px: calibration.rms_px,
+        outliers: calibration.outliers,
+        distance_95: [0.5, 1.0, 2.0].map(at).into(),
+        focal_px: [0, 1].map(|k| calibration.heads[k].camera.fx),
+    }
+}
+
+/// Writes URDF and configuration.
+fn write(args: &Calibrate, opened: &Opened, calibration: &Calibration) -> Result<(), Failure> {
+    let failed = |error: &dyn std::fmt::Display| {
+        Failure::failed(
+            format!("cannot write {}: {error}", args.out.display()),
+            "choose a file that you may write; the URDF must be plain, without macros",
+        )
+    };
+    let mut description = opened.description.clone();
+    for (side, head) in Side::BOTH.into_iter().zip(&calibration.heads) {
+        let tip = &opened.config.head(side).optical_frame;
+        description = description.with_chain("base", tip, &head.chain).map_err(|e| failed(&e))?;
+    }
+    let urdf = args.out.with_extension("urdf");
+    let text = std::fs::read_to_string(&args.config).map_err(|e| failed(&e))?;
+    let mut table: toml::Table = text.parse().map_err(|e| failed(&e))?;
+    let name = urdf.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    table.insert("robot".into(), name.into());
+    for (side, head) in Side::BOTH.into_iter().zip(&calibration.heads) {
+        let camera = table.get_mut(side.name()).and_then(|head| head.get_mut("camera"));
+        if let Some(toml::Value::Table(camera)) = camera {
+            set_lens(camera, head);
+        }
+    }
+    if opened.simulator().is_some() {
+        // The simulated head stays as it was built, whatever is now believed of it.
+        let built = built_from(&args.config, &args.out).map_err(|e| failed(&e))?;
+        let built = toml::Value::String(built.to_string_lossy().into_owned());
+        table.insert("sim".into(), toml::Table::from_iter([(BUILT.to_owned(), built)]).into());
+    }
+    let text = toml::to_string(&table).map_err(|e| failed(&e))?;
+    let header = "# Written by `vergence calibrate`.\n";
+    std::fs::write(&urdf, &description.text)
+        .and_then(|()| std::fs::write(&args.out, format!("{header}{text}")))
+        .map_err(|e| failed(&e))
+}
+
+/// The path of the configuration that was read, from that of the one that is written.
+fn built_from(read: &Path, written: &Path) -> std::io::Result<PathBuf> {
+    let folder = |path: &Path| {
+        let folder = path.parent().filter(|f| !f.as_os_str().is_empty());
+        std::fs::canonicalize(folder.unwrap_or(Path::new(".")))
+    };
+    let name = read.file_name().unwrap_or_default();
+    match folder(read)? {
+        here if here == folder(written)? => Ok(name.into()),
+        other => Ok(other.join(name)),
+    }
+}
+
+fn set_lens(table: &mut toml::Table, head: &PanTiltHead) {
+    let camera = &head.camera;
+    for (key, value) in [("fx", camera.fx), ("fy", camera.fy), ("cx", camera.cx), ("cy", camera.cy)]
+    {
+        table.insert(key.into(), value.into());
+    }
+    let d = camera.distortion;
+    let distortion = [d.k1, d.k2, d.p1, d.p2, d.k3].map(toml::Value::from);
+    table.insert("distortion".into(), toml::Value::Array(distortion.into()));
+}
+
+fn print(args: &Calibrate, outcome: &Outcome) -> Result<(), Failure> {
+    if args.json {
+        return crate::output::json(outcome);
+    }
+    println!(
+        "{} places, {} and {} sightings, {} looks without the light",
+        outcome.places, outcome.sightings[0], outcome.sightings[1], outcome.missed
+    );
+    match (&outcome.figures, &outcome.reason) {
+        (Some(figures), _) => {
+            println!("residual {:.2} px rms", figures.rms_px);
+            for at in &figures.distance_95 {
+                println!(
+                    "distance {:.1} m: right to {:.1} mm with 95 % (calibration alone)",
+                    at.distance,
+                    1e3 * at.error
+                );
+            }
+            println!("written: {0}; try `vergence find OBJECT --config {0}`", args.out.display());
+        }
+        (None, reason) => {
+            println!("not calibrated: {}", reason.as_deref().unwrap_or("unknown reason"));
+        }
+    }
+    Ok(())
+}

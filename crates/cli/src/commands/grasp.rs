@@ -1,0 +1,84 @@
+//! `vergence grasp`: an object's name in, the object in the gripper out.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use vergence::{FindConfig, GraspConfig, Report};
+
+use crate::failure::Failure;
+use crate::progress::Progress;
+use crate::robot::RobotArgs;
+use crate::save::Saver;
+
+/// Find an object, grasp it and lift it.
+#[derive(Args)]
+pub struct Grasp {
+    /// Object id, as the tag advertises it.
+    object: String,
+    #[command(flatten)]
+    robot: RobotArgs,
+    /// Folder for the picture of every step and `recording.mcap`.
+    #[arg(long, value_name = "DIR")]
+    save: Option<PathBuf>,
+    /// Print the result as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Runs the command.
+pub fn run(args: &Grasp) -> Result<bool, Failure> {
+    let mut robot = args.robot.open()?;
+    robot.attach_arm(&args.object, args.save.is_some())?;
+    let find = FindConfig { seed: args.robot.seed, ..FindConfig::default() };
+    let config = GraspConfig { find, ..GraspConfig::default() };
+    let saver = args.save.as_deref().map(|dir| Saver::create(dir, &robot)).transpose()?;
+    let mut observer = (Progress::steps(), saver);
+    let truth = robot.truth(&args.object);
+    let mut report = vergence::grasp(&mut robot.system, &args.object, &config, &mut observer);
+    report.truth = truth;
+    if let Some(grasp) = &mut report.grasp {
+        grasp.physics = robot.physics();
+    }
+    let (progress, saver) = observer;
+    drop(progress);
+    if let (Some(saver), Some(dir)) = (saver, &args.save) {
+        robot.save_grasp(dir)?;
+        saver.finish(&report)?;
+    }
+    match args.json {
+        true => crate::output::json(&report)?,
+        false => print(&report),
+    }
+    Ok(report.grasp.is_some_and(|grasp| grasp.succeeded))
+}
+
+fn print(report: &Report) {
+    let Some(grasp) = &report.grasp else { return };
+    let object = &report.object_id;
+    let reason = report.reason.as_ref().or(grasp.reason.as_ref());
+    let hint = report.hint.or(grasp.hint).unwrap_or_default();
+    match (grasp.succeeded, reason) {
+        (true, _) => println!("{object}: in the hand"),
+        (false, reason) => {
+            println!("{object}: not grasped: {}", reason.map_or("", String::as_str));
+            println!("  what to do: {hint}");
+        }
+    }
+    if let (Some(approach), Some(width), Some(force), Some(margin)) =
+        (grasp.approach, grasp.width, grasp.force, grasp.margin)
+    {
+        let width = 1e3 * width;
+        println!("{approach} grasp, {width:.0} mm wide, {force:.0} N, margin {margin:.1}");
+    }
+    if let Some(shift) = grasp.corrected_by_mm {
+        println!("the second look moved it by {shift:.1} mm");
+    }
+    if let Some(physics) = &grasp.physics {
+        println!("the simulator says: it rose by {:.0} mm", physics.risen_mm);
+        if let Some(collision) = &physics.collision {
+            println!("the simulator says: {collision}");
+        }
+    }
+    let took = report.timeline.last().map_or(0.0, |step| step.end);
+    println!("{took:.1} s on the robot's clock");
+}

@@ -1,0 +1,270 @@
+//! Normal equations of the refinement, with errors that sites have in common.
+//!
+//! **In:** weighted residuals of contour sites with their derivatives, and priors. **Out:** the
+//! step of all unknowns and the pose's covariance.
+//!
+//! Sites along one edge do not err independently. A rounded or bent edge, a shadow, a lamp on one
+//! side move the whole edge, and both cameras see nearly the same of it. So every part of the body
+//! has unknown offset and tilt on the object that all views share, every short piece of it another
+//! offset, and every view sees the part with an offset of its own. All have priors and are
+//! eliminated (Schur complement) before the rest is solved. What is left of a long edge is about one
+//! number for where it lies, however many pixels it has; and what the cameras agree about (how far
+//! away the edge is) is known better than where on the object the edge is.
+//!
+//! Two variances are estimated on the way: the scatter of a part's edges in a view (print, clutter
+//! and noise make some edges far worse than others), and the offset of a part (heavy tails, as of a
+//! Student's t: a part that is seen to be far off may well be).
+
+use nalgebra::{Matrix4, Matrix6, RowVector4, SMatrix, SVector, Vector2, Vector4};
+
+use super::sites::Site;
+
+/// Unknowns that all views share: the pose's tangent and the logarithm of the size.
+const SHARED: usize = 7;
+/// Unknowns of each view.
+const OWN: usize = 4;
+/// Views at most: what has a fixed size is fast.
+pub(super) const VIEWS: usize = 2;
+/// All unknowns, and those of one part: its offset and tilt (m), its offset in each view (px).
+const ALL: usize = SHARED + OWN * VIEWS;
+const PART: usize = 2 + VIEWS;
+
+/// Length of a piece (m), and the deviation of its offset from its part's (m): dents, print.
+const PIECE: f64 = 0.015;
+const PIECE_SD: f64 = 0.0003;
+/// Deviation of a part's ends from its direction on the object (m).
+const TILT_SD: f64 = 0.0005;
+/// Deviation of what one view sees of a part from what all see (px): at least this, and this share
+/// of the scatter of its edges.
+const VIEW_SD_PX: f64 = 0.05;
+const SCATTER_SHARE: f64 = 0.3;
+/// Independent sites that the expected scatter of a part's edges counts for.
+const SCATTER_PRIOR: f64 = 1.5;
+/// Degrees of freedom of the parts' offsets.
+const OFFSET_TAIL: f64 = 2.0;
+
+/// Changes of the unknowns.
+#[derive(Clone)]
+pub(super) struct Move {
+    /// Of those all views share.
+    pub shared: SVector<f64, SHARED>,
+    /// Of each view's own.
+    pub own: Vec<Vector4<f64>>,
+}
+
+/// One measurement of a site.
+struct Edge {
+    /// Part and kind, piece, view.
+    key: (u32, u32, usize),
+    by_shared: SVector<f64, SHARED>,
+    by_own: Vector4<f64>,
+    /// Against a site with one edge of good contrast.
+    weight: f64,
+    residual: f64,
+    /// Pixels to a metre.
+    scale: f64,
+    /// Deviation of the part's offset (m).
+    offset_sd: f64,
+}
+
+/// A part's own unknowns once those of the others are: offset (m), tilt (m at its ends), offset in
+/// each view (px).
+struct Eliminated {
+    part: u32,
+    inverse: Matrix4<f64>,
+    mixed: SMatrix<f64, ALL, PART>,
+    rhs: Vector4<f64>,
+}
+
+/// The equations while they are built.
+pub(super) struct Equations {
+    views: usize,
+    sd_px: f64,
+    doubt: f64,
+    a: SMatrix<f64, ALL, ALL>,
+    b: SVector<f64, ALL>,
+    edges: Vec<Edge>,
+    parts: Vec<Eliminated>,
+}
+
+impl Equations {
+    /// No measurement yet. `sd_px` is how well edges fit at this stage; `doubt` multiplies the
+    /// deviations of all that sites have in common.
+    pub fn new(views: usize, sd_px: f64, doubt: f64) -> Self {
+        let mut a = SMatrix::zeros();
+        // Views that are not there keep their place; their unknowns stay zero.
+        for k in SHARED + OWN * views..ALL {
+            a[(k, k)] = 1.0;
+        }
+        let b = SVector::zeros();
+        Equations { views, sd_px, doubt, a, b, edges: Vec::new(), parts: Vec::new() }
+    }
+
+    /// Adds the measurement of a site.
+    pub fn edge(&mut self, site: &Site, by_own: &RowVector4<f64>, weight: f64, residual: f64) {
+        let part = 3 * u32::from(site.part) + site.kind as u32;
+        self.edges.push(Edge {
+            key: (part, (site.along / PIECE) as u32, site.view),
+            by_shared: site.by_pose.transpose(),
+            by_own: by_own.transpose(),
+            weight,
+            residual,
+            scale: site.px_per_metre,
+            offset_sd: site.offset_sd(),
+        });
+    }
+
+    /// Turns the sites into equations, without what only the parts' own offsets explain; to be
+    /// called once all sites are in. `offsets` are the parts' offsets as last seen.
+    pub fn share_errors(&mut self, offsets: &[(u32, f64)]) {
+        let mut edges = std::mem::take(&mut self.edges);
+        edges.sort_by_key(|e| e.key);
+        for part in edges.chunk_by(|a, b| a.key.0 == b.key.0) {
+            let known = offsets.iter().find(|o| o.0 == part[0].key.0);
+            self.part(part, known.map_or(0.0, |o| o.1));
+        }
+    }
+
+    fn part(&mut self, edges: &[Edge], offset: f64) {
+        let scatter: [f64; VIEWS] = std::array::from_fn(|v| self.scatter(edges, v));
+        let (first, last) = (edges[0].key.1, edges[edges.len() - 1].key.1);
+        let mut a = SMatrix::<f64, { ALL + PART }, { ALL + PART }>::zeros();
+        let mut b = SVector::<f64, { ALL + PART }>::zeros();
+        let mut of_site = b;
+        let mut of_piece = b;
+        for piece in edges.chunk_by(|a, b| a.key.1 == b.key.1) {
+            // From -1 to 1 along the part.
+            let place = f64::from(2 * (piece[0].key.1 - first)) / f64::from((last - first).max(1));
+            let place = if last > first { place - 1.0 } else { 0.0 };
+            of_piece.fill(0.0);
+            let (mut information, mut moment) = (0.0, 0.0);
+            for view in piece.chunk_by(|a, b| a.key.2 == b.key.2) {
+                let v = view[0].key.2;
+                let at = SHARED + OWN * v;
+                let weight: f64 = view.iter().map(|e| e.weight).sum();
+                of_site.fill(0.0);
+                let mut residual = 0.0;
+                for e in view {
+                    let w = e.weight / weight;
+                    of_site.fixed_rows_mut::<SHARED>(0).axpy(w, &e.by_shared, 1.0);
+                    of_site.fixed_rows_mut::<OWN>(at).axpy(w, &e.by_own, 1.0);
+                    residual += w * e.residual;
+                }
+                let scale = view[0].scale;
+                of_site[ALL] = scale;
+                of_site[ALL + 1] = scale * place;
+                of_site[ALL + 2 + v] = 1.0;
+                let weight = weight / scatter[v];
+                a.ger(weight, &of_site, &of_site, 1.0);
+                b.axpy(weight * residual, &of_site, 1.0);
+                of_piece.axpy(weight * scale, &of_site, 1.0);
+                information += weight * scale * scale;
+                moment += weight * scale * residual;
+            }
+            let share = 1.0 / (information + (self.doubt * PIECE_SD).powi(-2));
+            a.ger(-share, &of_piece, &of_piece, 1.0);
+            b.axpy(-share * moment, &of_piece, 1.0);
+        }
+        // Heavy tails: a part that was seen to be off by much may well be off by much.
+        let variance =
+            (OFFSET_TAIL * edges[0].offset_sd.powi(2) + offset.powi(2)) / (OFFSET_TAIL + 1.0);
+        let doubt = self.doubt * self.doubt;
+        let mut inner = a.fixed_view::<PART, PART>(ALL, ALL).into_owned();
+        inner[(0, 0)] += (doubt * variance).recip();
+        inner[(1, 1)] += (doubt * TILT_SD * TILT_SD).recip();
+        for (v, scatter) in scatter.iter().enumerate() {
+            let view = VIEW_SD_PX * VIEW_SD_PX + SCATTER_SHARE * SCATTER_SHARE * scatter;
+            inner[(2 + v, 2 + v)] += (doubt * view).recip();
+        }
+        let Some(inverse) = inner.try_inverse() else { return };
+        let mixed = a.fixed_view::<ALL, PART>(0, ALL).into_owned();
+        let rhs = b.fixed_rows::<PART>(ALL).into_owned();
+        let lost = mixed * inverse;
+        self.a += a.fixed_view::<ALL, ALL>(0, 0) - lost * mixed.transpose();
+        self.b += b.fixed_rows::<ALL>(0) - lost * rhs;
+        self.parts.push(Eliminated { part: edges[0].key.0, inverse, mixed, rhs });
+    }
+
+    /// Variance of a part's edges in a view about their mean (px^2).
+    fn scatter(&self, edges: &[Edge], view: usize) -> f64 {
+        let edges = || edges.iter().filter(|e| e.key.2 == view);
+        let weight: f64 = edges().map(|e| e.weight).sum();
+        if weight <= 0.0 {
+            return self.sd_px.powi(2);
+        }
+        let mean = edges().map(|e| e.weight * e.residual).sum::<f64>() / weight;
+        let squares: f64 = edges().map(|e| e.weight * (e.residual - mean).powi(2)).sum();
+        (SCATTER_PRIOR * self.sd_px.powi(2) + squares) / (SCATTER_PRIOR + weight)
+    }
+
+    fn add(
+        &mut self,
+        view: usize,
+        js: &SVector<f64, SHARED>,
+        jo: &Vector4<f64>,
+        weight: f64,
+        residual: f64,
+    ) {
+        let at = SHARED + OWN * view;
+        let mut by = SVector::<f64, ALL>::zeros();
+        by.fixed_rows_mut::<SHARED>(0).copy_from(js);
+        by.fixed_rows_mut::<OWN>(at).copy_from(jo);
+        self.a.ger(weight, &by, &by, 1.0);
+        self.b.axpy(weight * residual, &by, 1.0);
+    }
+
+    /// Adds information about the shared unknowns.
+    pub fn shared(&mut self, a: &SMatrix<f64, SHARED, SHARED>, b: &SVector<f64, SHARED>) {
+        let mut block = self.a.fixed_view_mut::<SHARED, SHARED>(0, 0);
+        block += a;
+        let mut rhs = self.b.fixed_rows_mut::<SHARED>(0);
+        rhs += b;
+    }
+
+    /// Adds a prior on a view's own unknowns: their precision and what is missing to their means.
+    pub fn own(&mut self, view: usize, precision: &Vector4<f64>, missing: &Vector4<f64>) {
+        let at = SHARED + OWN * view;
+        for k in 0..OWN {
+            self.a[(at + k, at + k)] += precision[k];
+            self.b[at + k] += precision[k] * missing[k];
+        }
+    }
+
+    /// Adds a measured pixel.
+    pub fn pixel(
+        &mut self,
+        view: usize,
+        by_shared: &SMatrix<f64, 2, SHARED>,
+        by_own: &SMatrix<f64, 2, OWN>,
+        weight: f64,
+        residual: &Vector2<f64>,
+    ) {
+        for k in 0..2 {
+            let (js, jo) = (by_shared.row(k).transpose(), by_own.row(k).transpose());
+            self.add(view, &js, &jo, weight, residual[k]);
+        }
+    }
+
+    /// The solution; `None` when it is not determined.
+    pub fn solve(self) -> Option<Solution> {
+        let factor = self.a.cholesky()?;
+        let x = factor.solve(&self.b);
+        let unit = SMatrix::<f64, ALL, 6>::identity();
+        let covariance = factor.solve(&unit).fixed_view::<6, 6>(0, 0).into_owned();
+        let own = (0..self.views).map(|v| x.fixed_rows::<OWN>(SHARED + OWN * v).into_owned());
+        let step = Move { shared: x.fixed_rows::<SHARED>(0).into_owned(), own: own.collect() };
+        let offset = |p: &Eliminated| (p.inverse * (p.rhs - p.mixed.tr_mul(&x)))[0];
+        let offsets = self.parts.iter().map(|p| (p.part, offset(p))).collect();
+        Some(Solution { step, covariance, offsets })
+    }
+}
+
+/// What the equations give.
+pub(super) struct Solution {
+    /// Changes of the unknowns.
+    pub step: Move,
+    /// Covariance of the pose's tangent.
+    pub covariance: Matrix6<f64>,
+    /// Offsets of the parts on the object (m).
+    pub offsets: Vec<(u32, f64)>,
+}

@@ -1,0 +1,98 @@
+//! Optima beside the best pose.
+//!
+//! **In:** the best refined pose. **Out:** the best of its neighbourhood, with a covariance that
+//! holds the others. Print, lips and shadows run parallel to the contour a pixel or two away, and a
+//! refinement stops at the first place that fits: the likelihood has several tops. The refinement is
+//! started again from where the contour lies a few pixels off, in every direction in which a pose can
+//! move it. The distinct tops are components of a mixture with their odds as weights; its second
+//! moment about the best is the covariance. So a pose whose edges are certain gets a small one, and a
+//! pose that might sit on the wrong line of print says so.
+
+use nalgebra::{Matrix6, Vector6};
+use vergence_geometry::Transform;
+use vergence_geometry::gaussian::{difference, perturb};
+
+use super::refine::{FINAL, Pass, Refined};
+use super::search::Search;
+use super::verdict::Explained;
+
+/// How far the contour is moved (px of the working scale, which is at most two of the picture's).
+const HOP_PX: f64 = 2.5;
+/// A start that comes this near (px) to a known optimum with its first pass will end there.
+const CAUGHT_PX: f64 = 0.4;
+/// Optima whose contours are nearer than this (px) are one.
+const SAME_PX: f64 = 0.2;
+/// Optima with lower odds do not count.
+const LEAST_ODDS: f64 = 0.01;
+/// A direction is left out when it takes more than this (rad or m) to move the contour that far: a
+/// turn about the axis of a solid of revolution.
+const BLIND: f64 = 0.2;
+/// Nats to one that count: edges along a contour are not independent of each other, so evidence
+/// comes cheaper than it is.
+pub const NATS_TO_ONE: f64 = 6.0;
+
+impl Search<'_> {
+    /// Moves to the best optimum nearby and widens the covariance by the others.
+    pub(super) fn settle(&self, best: &mut (Refined, Explained)) {
+        let metric = contour_metric(&best.0);
+        let apart = |a: &Refined, b: &Refined| {
+            let d = difference(&a.pose, &b.pose);
+            (d.transpose() * metric * d).x.sqrt()
+        };
+        let mut optima = vec![best.clone()];
+        for start in self.starts(&best.0, &metric) {
+            let mut trial = Refined { pose: start, ..best.0.clone() };
+            self.refine(&mut trial, &[Pass::new(1.0, 5.0, 4.0, true)]);
+            if optima.iter().any(|o| apart(&o.0, &trial) < CAUGHT_PX) {
+                continue;
+            }
+            self.refine(&mut trial, &[Pass::new(0.6, 4.0, 2.5, true), FINAL, FINAL]);
+            if optima.iter().all(|o| apart(&o.0, &trial) > SAME_PX) {
+                optima.push(self.both(trial));
+            }
+        }
+        *best = self.mixture(optima);
+    }
+
+    /// Poses whose contours lie off the given one's, one for every direction and sense.
+    fn starts(&self, from: &Refined, metric: &Matrix6<f64>) -> Vec<Transform> {
+        let hop = HOP_PX * self.scale().min(2.0);
+        let eigen = metric.symmetric_eigen();
+        let lengths = eigen.eigenvalues.map(|e| hop / e.max(1e-9).sqrt());
+        let steps = (0..6).filter(|&k| lengths[k] < BLIND);
+        let steps = steps.map(|k| eigen.eigenvectors.column(k) * lengths[k]);
+        steps
+            .flat_map(|d: Vector6<f64>| [perturb(&from.pose, &d), perturb(&from.pose, &-d)])
+            .collect()
+    }
+}
+
+/// Mean square shift of the contour across itself (px^2) by a tangent: `d' M d`.
+fn contour_metric(refined: &Refined) -> Matrix6<f64> {
+    let mut metric = Matrix6::zeros();
+    for site in &refined.sites {
+        let j = site.by_pose.fixed_columns::<6>(0);
+        metric += j.transpose() * j;
+    }
+    metric / refined.sites.len().max(1) as f64
+}
+
+impl Search<'_> {
+    /// The best of some optima with the second moment of all about it.
+    fn mixture(&self, mut optima: Vec<(Refined, Explained)>) -> (Refined, Explained) {
+        optima.sort_by(|a, b| b.1.evidence.total_cmp(&a.1.evidence));
+        let best = optima[0].1;
+        let odds = |e: &Explained| ((e.evidence - best.evidence) / NATS_TO_ONE).exp();
+        optima.retain(|o| odds(&o.1) > LEAST_ODDS);
+        let (mut covariance, mut total) = (Matrix6::zeros(), 0.0);
+        let place = optima[0].0.pose;
+        for (refined, explained) in &mut optima {
+            self.doubt(refined, &FINAL);
+            let d = difference(&place, &refined.pose);
+            covariance += (refined.covariance + d * d.transpose()) * odds(explained);
+            total += odds(explained);
+        }
+        let top = optima.swap_remove(0).0;
+        (Refined { covariance: covariance / total, ..top }, best)
+    }
+}

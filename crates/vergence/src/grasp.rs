@@ -1,0 +1,330 @@
+//! Grasp: find the object, plan, and carry the plan out with the heads looking on.
+//!
+//! ```text
+//! find -> plan -> transfer -> look again -> correct -> approach -> close -> lift -> verify
+//! ```
+//!
+//! In: an object's name. Out: the [`Report`] of the find with its `grasp` part; it is complete also
+//! when the grasp is refused or fails, and then says why. What the planner knows is what the robot
+//! knows: the tag's record, the recognised pose with its covariance, and the table's plane, which is
+//! z = 0 of the base frame by the convention of the URDF. Untagged things are not known to it; the
+//! arm watches for contact while it moves and stops at the first.
+//!
+//! Success is claimed only when the gripper feels the object after the lift *and* the heads have seen
+//! the landmark move as the hand did.
+
+use std::time::Duration;
+
+use nalgebra::{Translation3, Vector3};
+use vergence_devices::{
+    DeviceError, Execution, GripCommand, GripperReading, LedCommand, MotionLimits,
+};
+use vergence_geometry::{GaussianPoint, Solid, Trajectory};
+use vergence_grasp::{LiftVerdict, Obstacle, Plan, Refusal, Request, correct, plan, verify_lift};
+
+use crate::event::{Event, Observer};
+use crate::find::{FindConfig, Found, Run, Stop, describe};
+use crate::report::{GraspReport, Report};
+use crate::system::{Hand, System};
+
+/// Longest wait for the fingers to reach their goal.
+const FINGERS: Duration = Duration::from_secs(10);
+/// Longest wait for an answer of the arm's encoders.
+const ANSWER: Duration = Duration::from_secs(1);
+
+/// Settings of a grasp.
+#[derive(Debug, Clone, Default)]
+pub struct GraspConfig {
+    /// Of the find.
+    pub find: FindConfig,
+    /// Of the planner.
+    pub planner: vergence_grasp::Config,
+    /// Of every motion: the stop button and the force at which the arm stops by itself.
+    pub limits: MotionLimits,
+}
+
+/// Why a grasp ended without the object in the hand.
+#[derive(Debug, thiserror::Error)]
+enum Failure {
+    #[error("this robot has no arm")]
+    NoArm,
+    #[error("{0}")]
+    Refused(#[from] Refusal),
+    #[error("{step}: {what}")]
+    Motion { step: &'static str, what: String },
+    #[error("the fingers closed on nothing")]
+    Empty,
+    #[error("the object left the fingers during the lift")]
+    Dropped,
+    #[error("after the lift the landmark is not where the hand would have carried it: {0}")]
+    NotLifted(&'static str),
+    #[error("looking again: {0}")]
+    Look(#[from] Stop),
+    #[error("{0}")]
+    Device(#[from] DeviceError),
+}
+
+impl Failure {
+    /// What a person can do about it.
+    fn hint(&self) -> &'static str {
+        match self {
+            Failure::NoArm => "name the arm's driver in the configuration's table [arm]",
+            Failure::Refused(Refusal::Fixed(_) | Refusal::TooHeavy { .. }) => {
+                "if the record is wrong, write a correct one to the tag"
+            }
+            Failure::Refused(Refusal::Unreachable(_)) => "move the object nearer to the arm",
+            Failure::Refused(_) => "free the object's surroundings, or look from nearer",
+            Failure::Motion { .. } => "see what the arm touched, then bring it home",
+            Failure::Empty | Failure::Dropped | Failure::NotLifted(_) => {
+                "check the record's size, weight and material"
+            }
+            Failure::Look(stop) => stop.hint(),
+            Failure::Device(_) => "check cables, power and the configuration file",
+        }
+    }
+}
+
+/// Finds an object and lifts it.
+pub fn grasp(
+    system: &mut System,
+    object: &str,
+    config: &GraspConfig,
+    observer: &mut dyn Observer,
+) -> Report {
+    let mut run = Run::new(system, &config.find, observer);
+    let found = run.all(object);
+    let mut outcome = GraspReport::default();
+    let failure = match &found {
+        Ok(found) => Attempt { run: &mut run, config, found, report: &mut outcome }.all().err(),
+        Err(_) => None,
+    };
+    let mut report = describe(object, run, found.as_ref());
+    match failure {
+        None => outcome.succeeded = report.found,
+        Some(failure) => {
+            outcome.reason = Some(failure.to_string());
+            outcome.hint = Some(failure.hint());
+        }
+    }
+    if !report.found {
+        outcome.reason = Some("the object was not found".into());
+    }
+    report.grasp = Some(outcome);
+    report
+}
+
+/// The table's plane as the robot knows it; wider than any table, which does no harm.
+fn table() -> Obstacle {
+    Obstacle {
+        name: "table".into(),
+        base_from_solid: Translation3::new(0.75, 0.0, -0.02).into(),
+        solid: Solid::Cuboid { half: Vector3::new(1.5, 1.5, 0.02) },
+    }
+}
+
+/// One grasp of an object that was found.
+struct Attempt<'a, 'r> {
+    run: &'a mut Run<'r>,
+    config: &'a GraspConfig,
+    found: &'a Found,
+    report: &'a mut GraspReport,
+}
+
+impl Attempt<'_, '_> {
+    fn all(&mut self) -> Result<(), Failure> {
+        let hand = self.run.system.hand.clone().ok_or(Failure::NoArm)?;
+        let planned = self.step("plan", |a| a.plan(&hand))?;
+        self.describe(&planned);
+        self.step("transfer", |a| a.transfer(&planned))?;
+        let again = self.step("look again", Self::look_again)?;
+        self.run.observer.notice(&Event::Stage("pregrasp"));
+        let corrected = self.step("correct", |a| a.correct(&hand, &planned, &again))?;
+        self.describe(&corrected);
+        self.report.corrected_by_mm = Some(shift_mm(&planned, &corrected));
+        self.step("approach", |a| {
+            a.play("correction", &corrected.transfer, &a.config.limits.clone())?;
+            a.play("approach", &corrected.approach, &a.config.limits.clone())
+        })?;
+        self.step("close", |a| a.close(&corrected))?;
+        self.picture("closed")?;
+        self.step("lift", |a| a.lift(&corrected))?;
+        self.step("verify", |a| a.verify(&hand, &corrected, &again))
+    }
+
+    fn step<T>(
+        &mut self,
+        name: &'static str,
+        work: impl FnOnce(&mut Self) -> Result<T, Failure>,
+    ) -> Result<T, Failure> {
+        let start = self.run.begin(name);
+        let outcome = work(self);
+        self.run.end(name, start);
+        outcome
+    }
+
+    /// Takes a picture of a stage.
+    fn picture(&mut self, stage: &'static str) -> Result<(), Failure> {
+        self.run.look()?;
+        self.run.observer.notice(&Event::Stage(stage));
+        Ok(())
+    }
+
+    fn describe(&mut self, plan: &Plan) {
+        self.report.approach = Some(plan.grasp.hold.name());
+        self.report.width = Some(plan.grasp.width);
+        self.report.force = Some(plan.force);
+        self.report.margin = Some(plan.margin.ratio);
+    }
+
+    fn plan(&mut self, hand: &Hand) -> Result<Plan, Failure> {
+        let start = self.arm()?.read(ANSWER)?.positions;
+        let obstacles = [table()];
+        let request = self.request(self.found, &start, &obstacles);
+        Ok(plan(&hand.robot, &request, &self.config.planner)?)
+    }
+
+    fn correct(&mut self, hand: &Hand, first: &Plan, again: &Found) -> Result<Plan, Failure> {
+        let start = self.arm()?.read(ANSWER)?.positions;
+        let obstacles = [table()];
+        let request = self.request(again, &start, &obstacles);
+        Ok(correct(&hand.robot, first, &request, &self.config.planner)?)
+    }
+
+    fn request<'q>(
+        &self,
+        seen: &'q Found,
+        start: &'q [f64; 6],
+        obstacles: &'q [Obstacle],
+    ) -> Request<'q> {
+        Request {
+            record: &seen.record,
+            object: &seen.object.pose,
+            landmark: 0,
+            start,
+            obstacles,
+            free_azimuths: &[],
+            seed: self.config.find.seed,
+        }
+    }
+
+    /// Opens the fingers and goes to before the object.
+    fn transfer(&mut self, plan: &Plan) -> Result<(), Failure> {
+        self.grip(plan.grasp.opening, plan.force)?;
+        self.play("transfer", &plan.transfer, &self.config.limits.clone())
+    }
+
+    /// The landmark is measured anew and the object recognised anew, from where the heads stand.
+    fn look_again(&mut self) -> Result<Found, Failure> {
+        Ok(self.run.again(self.found)?)
+    }
+
+    fn close(&mut self, plan: &Plan) -> Result<(), Failure> {
+        let reading = self.grip(0.0, plan.force)?;
+        self.report.closed_width = Some(reading.width);
+        if reading.holding { Ok(()) } else { Err(Failure::Empty) }
+    }
+
+    /// With the object in the hand contact is wanted: only the stop button ends this motion.
+    fn lift(&mut self, plan: &Plan) -> Result<(), Failure> {
+        let limits = MotionLimits { contact_force: f64::INFINITY, ..self.config.limits.clone() };
+        self.play("lift", &plan.lift, &limits)?;
+        let held = self.arm()?.gripper(ANSWER)?.holding;
+        if held { Ok(()) } else { Err(Failure::Dropped) }
+    }
+
+    /// Looks where the landmark is now and compares with how the hand has moved.
+    fn verify(&mut self, hand: &Hand, plan: &Plan, before: &Found) -> Result<(), Failure> {
+        let unclear = Failure::NotLifted("the plan has no lift");
+        let motion = plan.lift_motion(&hand.robot.arm).ok_or(unclear)?;
+        let expected = GaussianPoint {
+            position: motion * before.landmark.position,
+            covariance: before.landmark.covariance,
+        };
+        let after = self.run.measure(before.tag, &expected.position)?;
+        self.picture("lifted")?;
+        let verdict = verify_lift(&before.landmark, &after, &motion);
+        self.report.verified = Some(verdict == LiftVerdict::Held);
+        match verdict {
+            LiftVerdict::Held => Ok(()),
+            LiftVerdict::Slipped { .. } => Err(Failure::NotLifted("it slipped")),
+            LiftVerdict::Left => Err(Failure::NotLifted("it stayed where it was")),
+            LiftVerdict::Unclear => Err(Failure::NotLifted("the measurements do not tell")),
+        }
+    }
+
+    fn arm(&mut self) -> Result<&mut Box<dyn vergence_devices::Arm>, Failure> {
+        self.run.system.robot.arm.as_mut().ok_or(Failure::NoArm)
+    }
+
+    fn grip(&mut self, width: f64, force: f64) -> Result<GripperReading, Failure> {
+        let reading = self.arm()?.grip(GripCommand { width, force }, FINGERS)?;
+        self.run.observer.notice(&Event::Gripped(&reading));
+        Ok(reading)
+    }
+
+    /// Plays a motion to its end; anything else is a failure that says what happened.
+    fn play(
+        &mut self,
+        step: &'static str,
+        trajectory: &Trajectory,
+        limits: &MotionLimits,
+    ) -> Result<(), Failure> {
+        let (start, names) = (self.run.system.robot.clock.now(), self.arm()?.joint_names());
+        self.run.observer.notice(&Event::Motion { start, names: &names, trajectory });
+        let outcome = self.arm()?.execute(trajectory, limits)?;
+        let end = self.run.system.robot.clock.now();
+        self.run.observer.notice(&Event::Moved { start, end, names: &names, trajectory });
+        let what = match outcome {
+            Execution::Reached => return Ok(()),
+            Execution::Stopped => "stopped on command".into(),
+            Execution::Contact { link, force } => {
+                self.report.contact = Some(link.clone());
+                format!("{link} touched something with {force:.1} N")
+            }
+            Execution::Lost { reason } => reason,
+        };
+        Err(Failure::Motion { step, what })
+    }
+}
+
+/// How far the second look moved the grasp (mm).
+fn shift_mm(first: &Plan, second: &Plan) -> f64 {
+    let (a, b) = (first.base_from_tip.translation.vector, second.base_from_tip.translation.vector);
+    1e3 * (a - b).norm()
+}
+
+/// The LED is told to stop whatever came of the look.
+impl Run<'_> {
+    /// Measures the landmark and recognises the object once more, starting from where it was.
+    fn again(&mut self, found: &Found) -> Result<Found, Stop> {
+        let (landmark, angles) = self.relocate(found.tag, &found.landmark.position)?;
+        let frames = self.look()?;
+        let object = self.recognise(&found.record, landmark, &frames, angles)?;
+        Ok(Found { object, landmark, ..found.clone() })
+    }
+
+    /// Measures where the landmark is that should be near a point (base).
+    fn measure(
+        &mut self,
+        tag: vergence_devices::TagAddress,
+        near: &nalgebra::Point3<f64>,
+    ) -> Result<GaussianPoint, Stop> {
+        Ok(self.relocate(tag, near)?.0)
+    }
+
+    fn relocate(
+        &mut self,
+        tag: vergence_devices::TagAddress,
+        near: &nalgebra::Point3<f64>,
+    ) -> Result<(GaussianPoint, [[f64; 2]; 2]), Stop> {
+        // The report keeps where the landmark was found at first.
+        let first = self.landmark.clone();
+        let pattern = self.start_blinking(tag)?;
+        let located = self.locate_near(tag, &pattern, near);
+        let stopped = self.command(tag, LedCommand::Stop);
+        self.landmark = first;
+        let located = located?;
+        stopped?;
+        Ok(located)
+    }
+}
