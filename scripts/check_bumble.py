@@ -1,21 +1,30 @@
 #!/usr/bin/env python3
-"""Checks our tags against a foreign Bluetooth stack: Google's bumble as the robot.
+"""Checks tags and robot against a foreign Bluetooth implementation: Google's bumble.
 
-Needs `pip install bumble` (0.0.236 was used). Starts the tag server of crates/link, joins its virtual
-air over TCP, and does what a robot does: scan with scan responses, discover, read, command, be
-notified, be refused, pair (Just Works and passkey), read what is encrypted.
+Needs `pip install bumble` (0.0.236 was used). Two parts:
+
+- bumble is the robot's stack. It joins the virtual air of crates/link over TCP and does what a robot
+  does: scan with scan responses, discover, read, command, be notified, be refused, pair (Just Works
+  and passkey), read what is encrypted.
+- bumble is the radio. `vergence-tagd` and `vergence tag` each get one of its virtual controllers over
+  TCP; the robot discovers the tag, is refused, pairs, reads what is encrypted, commands, writes.
 
     python3 scripts/check_bumble.py
 """
 
 import asyncio
 import re
+import socket
 import subprocess
 import sys
+import tempfile
+from pathlib import Path
 
+from bumble.controller import Controller
 from bumble.core import UUID, ProtocolError
 from bumble.device import Device
 from bumble.hci import Address
+from bumble.link import LocalLink
 from bumble.pairing import PairingConfig, PairingDelegate
 from bumble.transport import open_transport
 
@@ -131,6 +140,91 @@ async def run(port):
         await connection.disconnect()
 
 
+TAG_SETTINGS = """
+store = "{folder}/tag.flash"
+passkey = {passkey}
+record_access = "encrypted"
+controller = {{ tcp = "127.0.0.1:{port}" }}
+lights = [{{ led = "{folder}/led" }}]
+"""
+RECORD_FILE = """
+object_id = "{id}"
+landmarks = [{{ position = [0.04, 0.0, 0.0], normal = [1.0, 0.0, 0.0] }}]
+bounding_box = {{ width = 0.08, length = 0.08, height = 0.09 }}
+shape = {{ kind = "box" }}
+"""
+
+
+async def vergence(folder, *arguments):
+    """Runs a command of the robot; its exit status and all that it said."""
+    process = await asyncio.create_subprocess_exec(
+        "target/debug/vergence", *arguments, "--config", f"{folder}/workcell.toml",
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+    )
+    said, _ = await asyncio.wait_for(process.communicate(), 60)
+    return process.returncode, said.decode()
+
+
+async def foreign_radio(folder):
+    """Our tag and our robot, each on a controller of bumble's."""
+    air = LocalLink()
+    ports, controllers = [], []
+    for name in ("tag", "robot"):
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            ports.append(probe.getsockname()[1])
+        transport = await open_transport(f"tcp-server:127.0.0.1:{ports[-1]}")
+        controllers.append(
+            Controller(name, host_source=transport.source, host_sink=transport.sink, link=air)
+        )
+    led = folder / "led"
+    led.mkdir()
+    (led / "max_brightness").write_text("255")
+    (folder / "tag.toml").write_text(
+        TAG_SETTINGS.format(folder=folder, passkey=PASSKEY, port=ports[0])
+    )
+    for name in ("cup", "mug"):
+        (folder / f"{name}.toml").write_text(RECORD_FILE.format(id=name))
+    subprocess.run(["target/debug/vergence", "workcell", folder], check=True, stdout=subprocess.DEVNULL)
+    config = folder / "workcell.toml"
+    radio = f'[radio]\ndriver = "hci"\ntcp = "127.0.0.1:{ports[1]}"\nbonds = "tags.bonds"'
+    config.write_text(config.read_text().replace('[radio]\ndriver = "sim"', radio))
+
+    tag = await asyncio.create_subprocess_exec(
+        "target/debug/vergence-tagd", folder / "tag.toml", "--record", folder / "cup.toml",
+        stderr=subprocess.PIPE,
+    )
+    try:
+        hello = (await asyncio.wait_for(tag.stderr.readline(), 10)).decode()
+        address = re.search(r"tag ([0-9A-F:]{17})", hello).group(1)
+        # bumble delivers no scan responses, so that the tag goes by its address.
+        status, said = await vergence(folder, "tag", "info", address)
+        check("our robot meets our tag", status == 0 and "Linux board" in said)
+        check("unpaired, the record is refused", "not for this robot" in said)
+        wrong = await vergence(folder, "tag", "pair", address, "--passkey", "000001")
+        check("a wrong passkey is refused", wrong[0] == 1 and "pairing failed" in wrong[1])
+        await asyncio.sleep(2.5)
+        paired = await vergence(folder, "tag", "pair", address, "--passkey", str(PASSKEY))
+        check("paired by passkey", paired[0] == 0)
+        status, said = await vergence(folder, "tag", "info", address)
+        check("encrypted record read with the kept bond", status == 0 and "yes, not signed" in said)
+        blink = asyncio.create_task(
+            vergence(folder, "tag", "blink", address, "--pattern", "10", "--seconds", "1")
+        )
+        levels = set()
+        while not blink.done():
+            levels.add((led / "brightness").read_text())
+            await asyncio.sleep(0.01)
+        check("commanded, and its LED blinks", (await blink)[0] == 0 and {"0", "255"} <= levels)
+        written = await vergence(folder, "tag", "write", str(folder / "mug.toml"), "--to", address)
+        check("a new record is written", written[0] == 0)
+        status, said = await vergence(folder, "tag", "info", address)
+        check("and the tag serves it", status == 0 and "yes, not signed" in said)
+    finally:
+        tag.kill()
+        await tag.wait()
+
+
 def main():
     command = ["cargo", "run", "--quiet", "-p", "vergence-link", "--example", "tag_server"]
     server = subprocess.Popen([*command, "--", "127.0.0.1:0"], stdout=subprocess.PIPE, text=True)
@@ -139,6 +233,9 @@ def main():
         asyncio.run(asyncio.wait_for(run(port), 60))
     finally:
         server.kill()
+    subprocess.run(["cargo", "build", "-q", "-p", "vergence-cli", "-p", "vergence-tagd"], check=True)
+    with tempfile.TemporaryDirectory() as folder:
+        asyncio.run(asyncio.wait_for(foreign_radio(Path(folder)), 180))
     print("all good")
     return 0
 

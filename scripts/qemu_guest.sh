@@ -89,7 +89,7 @@ guest_run() {
     -no-reboot -kernel "$guest/kernel/boot/vmlinuz-$kernel" -initrd "$root.cpio.gz" \
     -append "console=ttyS0 loglevel=1 no_timer_check panic=-1 mitigations=off rdinit=/init" \
     -serial stdio "$@" </dev/null >"$log" 2>&1 || echo "the machine was stopped after $limit s" >>"$log"
-  tr -d '\r' <"$log" | sed '0,/^guest: begin$/d' >"$log.clean"
+  tr -d '\r' <"$log" | sed '0,/^guest: begin$/d; /reboot: Power down$/d' >"$log.clean"
   if ! grep -q . "$log.clean"; then
     tail -30 "$log"
   fi

@@ -25,6 +25,8 @@ use crate::radio;
 pub const SIM: &str = "sim";
 /// The radio driver for Bluetooth controllers.
 pub const HCI: &str = "hci";
+/// The radio driver for the Bluetooth daemon of desktop Linux.
+pub const BLUEZ: &str = "bluez";
 const DYNAMIXEL: &str = "dynamixel";
 
 /// The heads' devices are the simulator's; an error when some are and some are not.
@@ -74,7 +76,7 @@ pub fn open(config: &Config, description: &Description, folder: &Path) -> Result
     let until = |device: DynamixelPanTilt| Until { interrupt: interrupt.clone(), device };
     let heads =
         [head(Side::Left, Box::new(until(left)))?, head(Side::Right, Box::new(until(right)))?];
-    Ok(Robot { clock: Box::new(clock), heads, radio: Box::new(radio.link), arm: None })
+    Ok(Robot { clock: Box::new(clock), heads, radio: radio.link, arm: None })
 }
 
 /// The servos of both heads.

@@ -15,6 +15,7 @@ mod progress;
 mod radio;
 mod robot;
 mod save;
+mod signing;
 
 use std::process::ExitCode;
 

@@ -5,46 +5,77 @@ use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
 use vergence_devices::clock::SystemClock;
+use vergence_devices::config::RadioConfig;
 use vergence_devices::{Clock, Config};
-use vergence_link::{BOND_BYTES, Bond, HciLink, LinkConfig};
+use vergence_link::{BOND_BYTES, Bond, HciLink, LinkConfig, TagRadio};
 use vergence_sim::Workcell;
+use vergence_tag::signature::TrustedKeys;
 
+use crate::drivers::BLUEZ;
 use crate::failure::Failure;
+use crate::signing;
 
 /// An opened radio.
 pub struct Radio {
     /// The radio.
-    pub link: HciLink,
+    pub link: Box<dyn TagRadio>,
     /// The time that it runs on.
     pub clock: Box<dyn Clock>,
+    /// Whose signatures on records count.
+    pub trusted: TrustedKeys,
     /// Where its bonds are kept.
     bonds: Option<PathBuf>,
 }
 
-/// Opens the controller that the driver `hci` names, with the bonds of earlier runs.
+/// Opens the radio that the configuration names, with the bonds of earlier runs.
 pub fn open(config: &Config, folder: &Path) -> Result<Radio, Failure> {
     let radio = &config.radio;
-    let link = match (&radio.tcp, &radio.device) {
-        (Some(address), None) => HciLink::tcp(address, LinkConfig::default()),
-        (None, Some(path)) => HciLink::device(&path.to_string_lossy(), LinkConfig::default()),
-        _ => {
-            return Err(Failure::misuse(
-                "the radio driver \"hci\" needs one controller",
-                "write tcp = \"host:port\" or device = \"/dev/ttyACM0\" into [radio]",
-            ));
-        }
+    let link: Box<dyn TagRadio> = match radio.driver.as_str() {
+        BLUEZ => bluez(radio.adapter.as_deref())?,
+        _ => Box::new(hci(radio)?),
     };
-    let link = link.map_err(|error| Failure::failed(error, "is the controller there and free?"))?;
+    let trusted = signing::trusted(config, folder)?;
     let bonds = radio.bonds.as_ref().map(|file| folder.join(file));
-    let mut radio = Radio { link, clock: Box::new(SystemClock::start()), bonds };
+    let mut radio = Radio { link, clock: Box::new(SystemClock::start()), trusted, bonds };
     radio.load()?;
     Ok(radio)
 }
 
+/// Opens the controller that the driver `hci` names.
+fn hci(radio: &RadioConfig) -> Result<HciLink, Failure> {
+    let config = LinkConfig::default();
+    let link = match (&radio.tcp, &radio.device, radio.linux) {
+        (Some(address), None, None) => HciLink::tcp(address, config),
+        (None, Some(path), None) => HciLink::device(&path.to_string_lossy(), config),
+        (None, None, Some(controller)) => HciLink::linux(controller, config),
+        _ => {
+            return Err(Failure::misuse(
+                "the radio driver \"hci\" needs one controller",
+                "write tcp = \"host:port\", device = \"/dev/ttyACM0\" or linux = 0 into [radio]",
+            ));
+        }
+    };
+    link.map_err(|error| Failure::failed(error, "is the controller there and free?"))
+}
+
+#[cfg(feature = "bluez")]
+fn bluez(adapter: Option<&str>) -> Result<Box<dyn TagRadio>, Failure> {
+    let link = vergence_link::BluezLink::open(adapter);
+    Ok(Box::new(link.map_err(|error| Failure::failed(error, "does bluetoothd run?"))?))
+}
+
+#[cfg(not(feature = "bluez"))]
+fn bluez(_: Option<&str>) -> Result<Box<dyn TagRadio>, Failure> {
+    Err(Failure::misuse(
+        "this program was built without the radio driver \"bluez\"",
+        "build it with --features bluez, or use the driver \"hci\"",
+    ))
+}
+
 impl Radio {
     /// The radio of a simulated workcell, whose tags and bonds live as long as the program.
-    pub fn simulated(workcell: &Workcell) -> Self {
-        Radio { link: workcell.radio(), clock: workcell.clock(), bonds: None }
+    pub fn simulated(workcell: &Workcell, trusted: TrustedKeys) -> Self {
+        Radio { link: Box::new(workcell.radio()), clock: workcell.clock(), trusted, bonds: None }
     }
 
     /// Takes up the bonds of earlier runs.

@@ -9,11 +9,13 @@ use vergence::report::{PhysicsReport, Report, TruthReport, numbers};
 use vergence_devices::{Config, Description, Robot};
 use vergence_geometry::Transform;
 use vergence_sim::{Scenario, SimConfig, Workcell};
+use vergence_tag::signature::TrustedKeys;
 
 use crate::bench::{self, SharedBench};
-use crate::drivers::{self, HCI, SIM};
+use crate::drivers::{self, BLUEZ, HCI, SIM};
 use crate::failure::Failure;
 use crate::radio::{self, Radio};
+use crate::signing;
 
 /// Key of `[sim]` for [`built`].
 pub const BUILT: &str = "built";
@@ -58,16 +60,19 @@ impl RobotArgs {
             Some(path) => {
                 let (config, description) = read(path)?;
                 check_drivers(&config)?;
+                let signers = signing::required(&config, folder(path))?;
                 if !drivers::simulated(&config)? {
                     let devices = drivers::open(&config, &description, folder(path))?;
-                    return Opened::wired(config, description, devices);
+                    let opened = Opened::wired(config, description, devices)?;
+                    return Ok(opened.signed_by(signers));
                 }
                 let workcell = self.workcell(path, &config, &description)?;
                 let mut devices = workcell.robot();
-                if config.radio.driver == HCI {
-                    devices.radio = Box::new(radio::open(&config, folder(path))?.link);
+                if config.radio.driver != SIM {
+                    devices.radio = radio::open(&config, folder(path))?.link;
                 }
-                Opened::new(workcell, devices, config, description)
+                let opened = Opened::new(workcell, devices, config, description)?;
+                Ok(opened.signed_by(signers))
             }
             None => Opened::embedded(self.seed, Scenario::Default),
         }
@@ -91,18 +96,21 @@ impl RobotArgs {
 
     /// Opens the tag radio alone.
     pub fn open_radio(&self) -> Result<Radio, Failure> {
-        let workcell = match &self.config {
+        let (workcell, trusted) = match &self.config {
             Some(path) => {
                 let (config, description) = read(path)?;
                 check_drivers(&config)?;
-                if config.radio.driver == HCI {
+                if config.radio.driver != SIM {
                     return radio::open(&config, folder(path));
                 }
-                self.workcell(path, &config, &description)?
+                let trusted = signing::trusted(&config, folder(path))?;
+                (self.workcell(path, &config, &description)?, trusted)
             }
-            None => Workcell::embedded(self.seed).map_err(unusable)?,
+            None => {
+                (Workcell::embedded(self.seed).map_err(unusable)?, TrustedKeys::default())
+            }
         };
-        Ok(Radio::simulated(&workcell))
+        Ok(Radio::simulated(&workcell, trusted))
     }
 
     /// The simulated workcell of a configuration. A calibrated configuration names the one from which
@@ -179,6 +187,12 @@ impl Opened {
         self.bench.as_ref().map(|bench| bench::lock(bench).verdict())
     }
 
+    /// The same, for records that one of these keys signed.
+    fn signed_by(mut self, signers: Option<TrustedKeys>) -> Self {
+        self.system.required_signers = signers;
+        self
+    }
+
     /// The simulator's truth of an object.
     pub fn truth(&self, object: &str) -> Option<TruthReport> {
         let truth = self.workcell.as_ref()?.truth();
@@ -236,8 +250,8 @@ fn built(path: &Path, config: &Config) -> Result<Option<PathBuf>, Failure> {
 /// Refuses drivers of radio and arm that do not exist.
 fn check_drivers(config: &Config) -> Result<(), Failure> {
     match config.radio.driver.as_str() {
-        SIM | HCI => {}
-        other => return Err(drivers::unknown("radio", other, HCI)),
+        SIM | HCI | BLUEZ => {}
+        other => return Err(drivers::unknown("radio", other, "hci, bluez")),
     }
     match &config.arm {
         Some(arm) if arm.driver != SIM => Err(drivers::unknown("arm", &arm.driver, "no other")),

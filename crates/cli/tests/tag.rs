@@ -119,5 +119,45 @@ fn a_tag_behind_a_controller_is_paired_once_and_written_later() {
     let pair = ["tag", "pair", "can", "--passkey", "123456", "--config", config];
     assert!(!achieved(&pair).contains("not kept"));
     achieved(&write);
-    achieved(&["tag", "info", "kettle", "--config", config]);
+    let info = || achieved(&["tag", "info", "kettle", "--config", config]);
+    assert!(info().contains("yes, not signed"), "{}", info());
+
+    // The owner signs; who trusts his key is told so, who trusts another's as well.
+    let (key, other) = (dir.join("owner.pem"), dir.join("other.pem"));
+    for key in [&key, &other] {
+        achieved(&["tag", "key", key.to_str().unwrap()]);
+    }
+    assert!(refused(&["tag", "key", key.to_str().unwrap()], 1).contains("owner.pem"));
+    achieved(&[&write[..], &["--sign", key.to_str().unwrap()]].concat());
+    let text = std::fs::read_to_string(config).unwrap();
+    for (file, verdict) in [
+        ("owner.pub", "yes, signed by owner"),
+        ("other.pub", "yes, signed by a key that is not trusted"),
+    ] {
+        let radio = format!("[radio]\ntrusted_keys = [\"{file}\"]");
+        std::fs::write(config, text.replace("[radio]", &radio)).unwrap();
+        assert!(info().contains(verdict), "{}", info());
+    }
+    let tags: Value =
+        serde_json::from_str(&achieved(&["tags", "--config", config, "--json"])).unwrap();
+    assert_eq!(tags["tags"][0]["signature"], "signed by a key that is not trusted");
+}
+
+#[test]
+fn a_robot_that_wants_signatures_finds_nothing_unsigned() {
+    let dir = folder("unsigned");
+    let config = dir.join("workcell.toml");
+    achieved(&["workcell", dir.to_str().unwrap()]);
+    let text = std::fs::read_to_string(&config).unwrap();
+    let (path, find) = (config.to_str().unwrap(), |path| ["find", "cup", "--config", path]);
+    std::fs::write(&config, text.replace("[radio]", "[radio]\nrequire_signature = true")).unwrap();
+    assert!(refused(&find(path), 2).contains("trusts no key"));
+    achieved(&["tag", "key", dir.join("owner.pem").to_str().unwrap()]);
+    let radio = "[radio]\nrequire_signature = true\ntrusted_keys = [\"owner.pub\"]";
+    std::fs::write(&config, text.replace("[radio]", radio)).unwrap();
+    let output = vergence(&find(path));
+    let said = String::from_utf8_lossy(&output.stdout).into_owned()
+        + &String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("not signed") && said.contains("--sign"), "{said}");
 }

@@ -11,7 +11,7 @@
 //! servos = { driver = "sim" }
 //!
 //! [radio]
-//! driver = "sim"                   # or driver = "hci" with tcp = "host:port" or device = "/dev/ttyACM0"
+//! driver = "sim"                   # or "hci" with tcp = "host:port", device = "/dev/ttyACM0" or linux = 0, or "bluez"
 //! ```
 //!
 //! Unknown keys are errors that name the key. What only one driver needs stands in that driver's own
@@ -157,7 +157,8 @@ pub struct DriverConfig {
     pub driver: String,
 }
 
-/// The tag radio's driver. The driver `hci` needs to know where its controller is: `tcp` or `device`.
+/// The tag radio's driver. The driver `hci` needs to know where its controller is: `tcp`, `device` or
+/// `linux`. The driver `bluez` may name its adapter.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RadioConfig {
@@ -169,10 +170,24 @@ pub struct RadioConfig {
     /// Serial line of a Bluetooth controller, its speed and raw mode set.
     #[serde(default)]
     pub device: Option<PathBuf>,
+    /// Number of a Bluetooth controller of this computer (0 is `hci0`), taken from the kernel's own
+    /// host ("user channel"): it must be off, bluetoothd stopped; needs CAP_NET_ADMIN.
+    #[serde(default)]
+    pub linux: Option<u16>,
+    /// Adapter of BlueZ (`hci0`); without it BlueZ's default one.
+    #[serde(default)]
+    pub adapter: Option<String>,
     /// File that keeps the keys of tags that the robot paired with, relative to the configuration's
     /// folder. It is secret: whoever has it commands the tags.
     #[serde(default)]
     pub bonds: Option<PathBuf>,
+    /// Public keys (PEM) whose signatures on records the robot trusts, relative to the
+    /// configuration's folder.
+    #[serde(default)]
+    pub trusted_keys: Vec<PathBuf>,
+    /// Refuse to find objects whose records are not signed by one of them.
+    #[serde(default)]
+    pub require_signature: bool,
 }
 
 impl Config {

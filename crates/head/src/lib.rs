@@ -17,6 +17,7 @@
 // An index names a head or a joint in several arrays at once; zipped iterators would hide which.
 #![allow(clippy::needless_range_loop)]
 
+mod bounded;
 pub mod calibration;
 pub mod evaluation;
 mod fixation;

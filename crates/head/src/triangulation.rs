@@ -13,8 +13,9 @@
 //! ```
 //!
 //! The covariance is the block of `p` in the inverse of the normal matrix, so `b` is marginalised.
-//! With one fixation a head this is the optimal intersection of two rays; more fixations at slightly
-//! different angles ([`crate::dither`]) average the encoder's steps but not what they share.
+//! With one fixation a head this is the optimal intersection of two rays. More fixations at slightly
+//! different angles ([`crate::dither`]) narrow the encoder's steps down but not what they share: each
+//! head's are first made into one, which uses that rounding is bounded (module `bounded`).
 //!
 //! What it cannot do: tell a light from its image in a mirror that both heads see. Both rays then
 //! meet, behind the mirror. A mirror that shows different images to the heads, or a wrong pairing,
@@ -24,10 +25,15 @@ use nalgebra::{Matrix2, Matrix3, Point2, Point3, SMatrix, SVector, Vector2, Vect
 use vergence_geometry::{GaussianPoint, Ray};
 
 use crate::PanTiltHead;
+use crate::bounded;
 
 /// Rays that miss each other by more sigmas than this do not belong to one light: one right pair in
 /// fifteen thousand is refused.
 pub const GATE_SIGMAS: f64 = 4.0;
+
+/// From so many fixations of each head on, what they have in common is told by the bounds of their
+/// errors; below, the bounds tell nothing that the variance does not.
+const FEWEST_TO_COMBINE: usize = 3;
 
 /// Point and two joint errors for each of two heads.
 const UNKNOWNS: usize = 7;
@@ -135,13 +141,25 @@ pub fn triangulate_many(
     }
     let start = midpoint(heads, &[*left, *right], noise)?;
     let problem = Problem { heads, fixations, noise };
-    let (state, information, chi2) = problem.solve(start).ok_or(TriangulateError::Behind)?;
-    let covariance = information.try_inverse().ok_or(TriangulateError::Behind)?;
+    let (mut state, mut information, chi2) =
+        problem.solve(start).ok_or(TriangulateError::Behind)?;
     let freedom = 2 * (fixations[0].len() + fixations[1].len()) - 3;
     let gap_sigmas = (chi2 / freedom as f64).sqrt();
     if gap_sigmas > GATE_SIGMAS {
         return Err(TriangulateError::Gap { sigmas: gap_sigmas });
     }
+    if fixations.iter().all(|f| f.len() >= FEWEST_TO_COMBINE) && noise.step_sigma > 0.0 {
+        let about = Point3::new(state[0], state[1], state[2]);
+        let combine =
+            |k: usize| bounded::combine(&heads[k], fixations[k], noise.step_sigma, &about);
+        if let (Some(left), Some(right)) = (combine(0), combine(1)) {
+            // The encoder's steps are part of the combined fixations' covariance.
+            let noise = Noise { step_sigma: 0.0, ..*noise };
+            let combined = Problem { heads, fixations: [&[left], &[right]], noise: &noise };
+            (state, information, _) = combined.solve(about).ok_or(TriangulateError::Behind)?;
+        }
+    }
+    let covariance = information.try_inverse().ok_or(TriangulateError::Behind)?;
     let covariance = covariance.fixed_view::<3, 3>(0, 0).into_owned();
     let point = GaussianPoint {
         position: Point3::new(state[0], state[1], state[2]),

@@ -70,6 +70,13 @@ impl HciLink {
         Self::open(open, config).map_err(|reason| not_opened(path, reason))
     }
 
+    /// A radio on a controller of this computer (0 is `hci0`), taken from the kernel's own host: it must
+    /// be off and left alone by bluetoothd; the caller needs CAP_NET_ADMIN.
+    pub fn linux(controller: u16, config: LinkConfig) -> Result<Self, DeviceError> {
+        Self::open(move || StreamTransport::user_channel(controller), config)
+            .map_err(|reason| not_opened(&format!("hci{controller}"), reason))
+    }
+
     /// A radio over any transport, which is made on the radio's own thread.
     pub fn open<T>(
         transport: impl FnOnce() -> io::Result<T> + Send + 'static,

@@ -7,8 +7,10 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Poll, Waker};
 use std::time::Duration;
 
+use trouble_host::att::AttErrorCode;
+use trouble_host::{BleHostError, Error};
 use vergence_devices::{Advertisement, DeviceError, TagAddress, TagState};
-use vergence_tag::Command;
+use vergence_tag::{Command, gatt};
 
 /// Work on one tag over a link.
 #[derive(Debug, Clone, PartialEq)]
@@ -102,7 +104,46 @@ pub(crate) enum Fault {
     Dead(String),
 }
 
+/// A failure of the host in words.
+pub(crate) fn describe<E: core::fmt::Debug>(error: &BleHostError<E>) -> String {
+    match error {
+        BleHostError::Controller(error) => format!("{error:?}"),
+        BleHostError::BleHost(error) => format!("{error:?}"),
+    }
+}
+
 impl Fault {
+    /// What a failure of the host means for the job.
+    pub fn of<E: core::fmt::Debug>(error: BleHostError<E>) -> Self {
+        let refused = |what: &str| Fault::Refused(what.into());
+        match error {
+            BleHostError::BleHost(Error::Att(code)) => match code {
+                AttErrorCode::INSUFFICIENT_AUTHENTICATION
+                | AttErrorCode::INSUFFICIENT_ENCRYPTION
+                | AttErrorCode::INSUFFICIENT_AUTHORISATION => {
+                    refused("refuses this to robots that are not paired with it")
+                }
+                code if code == AttErrorCode::new(gatt::ERROR_MALFORMED) => {
+                    refused("does not understand what it was sent")
+                }
+                code if code == AttErrorCode::new(gatt::ERROR_IMPOSSIBLE) => {
+                    refused("was asked for what it cannot do or hold")
+                }
+                code if code == AttErrorCode::new(gatt::ERROR_STORAGE) => {
+                    refused("could not store the record")
+                }
+                code => Fault::Refused(format!("refuses: {code:?}")),
+            },
+            BleHostError::BleHost(
+                Error::Disconnected
+                | Error::Timeout
+                | Error::NotFound
+                | Error::ConnectionLimitReached,
+            ) => Fault::Lost,
+            other => Fault::Refused(format!("answers nonsense ({})", describe(&other))),
+        }
+    }
+
     /// As callers of the device traits see it.
     pub fn device_error(self, device: String, timeout: Duration) -> DeviceError {
         match self {

@@ -12,6 +12,7 @@
 #[cfg(feature = "bluez")]
 mod bluez;
 mod central;
+mod conversation;
 mod ears;
 mod flash;
 mod hci;

@@ -38,6 +38,9 @@ pub trait TagRadio: TagLink {
     /// Takes up a bond of an earlier run.
     fn add_bond(&mut self, bond: Bond) -> Result<(), DeviceError>;
 
+    /// Bonds outlast the process without being given back.
+    fn keeps_bonds(&self) -> bool;
+
     /// Ends the link that is held for a tag whose light plays; the light goes out.
     fn release(&mut self, tag: TagAddress) -> Result<(), DeviceError>;
 }
@@ -72,6 +75,10 @@ impl TagRadio for HciLink {
 
     fn add_bond(&mut self, bond: Bond) -> Result<(), DeviceError> {
         HciLink::add_bond(self, bond)
+    }
+
+    fn keeps_bonds(&self) -> bool {
+        false
     }
 
     fn release(&mut self, tag: TagAddress) -> Result<(), DeviceError> {

@@ -133,6 +133,7 @@ fn floods() -> Vec<(String, Vec<Act>)> {
     vec![
         ("2000 write commands".into(), commands.chain([Pause, Pause]).collect()),
         ("200 reads at once".into(), reads.chain([Pause, Pause]).collect()),
+        ("a read, then gone".into(), vec![Frame(4, vec![0x0A, 3, 0]), Leave]),
         ("200 searches, then gone".into(), lists.chain([Leave]).collect()),
         ("nothing at all".into(), vec![Pause, Leave]),
     ]

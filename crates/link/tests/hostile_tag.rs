@@ -136,6 +136,17 @@ fn cases() -> Vec<(&'static str, Answers, Expected)> {
             },
             Error,
         ),
+        ("half a record", |r| polite(r).unwrap_or_else(|| value(r, &record("cup")[..60])), Error),
+        (
+            "record with a changed byte",
+            |r| {
+                let mut bytes = record("cup");
+                bytes[9] ^= 0x80;
+                polite(r).unwrap_or_else(|| value(r, &bytes))
+            },
+            Error,
+        ),
+        ("300 bytes of nothing", |r| polite(r).unwrap_or_else(|| value(r, &[0; 300])), Error),
         (
             "record of another object",
             |r| polite(r).unwrap_or_else(|| value(r, &record("can"))),

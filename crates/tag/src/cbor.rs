@@ -9,6 +9,7 @@ use minicbor::encode::{Error as EncodeError, Write};
 use minicbor::{Decoder, Encoder};
 
 use crate::Vec3;
+use crate::cose;
 use crate::record::{
     BoundingBox, Invalid, LandmarkSite, Mobility, Physical, Record, Semantic, Shape, Text,
 };
@@ -123,8 +124,15 @@ fn shape<W: Write>(e: &mut Encoder<W>, shape: &Shape) -> Encoded<W> {
     Ok(())
 }
 
-/// Reads and validates a record.
+/// Reads and validates a record, plain or in the envelope of a signature, which is not checked here.
 pub fn decode(bytes: &[u8]) -> Result<Record, RecordError> {
+    if cose::is_signed(bytes) {
+        return plain(cose::open(bytes)?.payload);
+    }
+    plain(bytes)
+}
+
+fn plain(bytes: &[u8]) -> Result<Record, RecordError> {
     let mut d = Decoder::new(bytes);
     let (mut id, mut landmarks, mut sides, mut form) = (None, None, None, None);
     let (mut physical, mut semantic) = (Physical::default(), Semantic::default());
@@ -178,7 +186,7 @@ pub fn decode(bytes: &[u8]) -> Result<Record, RecordError> {
 }
 
 /// Walks a definite map with unsigned keys; other keys and their values are read over.
-fn entries<'b>(
+pub(crate) fn entries<'b>(
     d: &mut Decoder<'b>,
     mut entry: impl FnMut(&mut Decoder<'b>, u64) -> Result<(), DecodeError>,
 ) -> Result<(), DecodeError> {

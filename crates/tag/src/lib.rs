@@ -4,16 +4,21 @@
 //! have fixed capacities. [`Record`] is Table 1 of the paper and a little more; [`cbor`] is its wire
 //! form (RFC 8949, schema in `docs/record.cddl`); [`Pattern`] is what the LED plays, [`Command`] how
 //! it is told, [`gatt`] where on the tag's Bluetooth server, [`Upload`] how a new record gets there,
-//! and [`Beacon`] what the tag says of itself to everybody. With the feature `std` (default) the record also reads and writes as JSON or TOML through serde.
+//! and [`Beacon`] what the tag says of itself to everybody. A record may be wrapped in a signature
+//! ([`cose`]). With the feature `std` (default) the record also reads and writes as JSON or TOML
+//! through serde; with `signature` records are signed, and signatures judged.
 #![cfg_attr(not(feature = "std"), no_std)]
 
 pub mod beacon;
 pub mod cbor;
 pub mod codebook;
 pub mod command;
+pub mod cose;
 pub mod gatt;
 pub mod pattern;
 pub mod record;
+#[cfg(feature = "signature")]
+pub mod signature;
 pub mod upload;
 
 pub use beacon::Beacon;

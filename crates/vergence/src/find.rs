@@ -14,6 +14,7 @@ use vergence_geometry::{GaussianPoint, Symmetry, Transform};
 use vergence_imaging::Frame;
 use vergence_landmark::FinderError;
 use vergence_pose::{ObjectPose, Query, Refusal, View};
+use vergence_tag::signature::Verdict;
 use vergence_tag::{Pattern, Record, RecordError};
 
 use crate::event::{Event, Observer};
@@ -84,6 +85,8 @@ pub(crate) enum Stop {
     Ambiguous { object: String, count: usize },
     #[error("the tag's record is not usable: {0}")]
     Record(#[from] RecordError),
+    #[error("the tag's record is refused: {0}")]
+    Signature(Verdict),
     #[error("the tag advertises \"{advertised}\" but its record says \"{recorded}\"")]
     WrongRecord { advertised: String, recorded: String },
     #[error("the tag answers, but its light was not seen in {views} views by {missing}")]
@@ -127,6 +130,9 @@ impl Stop {
             }
             Stop::Ambiguous { .. } => "switch one of the tags off, or write another id to it",
             Stop::Record(_) | Stop::WrongRecord { .. } => "write a correct record to the tag",
+            Stop::Signature(_) => {
+                "this robot wants records that are signed by a key of `trusted_keys`: `vergence tag write --sign`"
+            }
             Stop::NotSeen { .. } => {
                 "turn the object so that its landmark faces the cameras, or remove what hides it"
             }
@@ -344,6 +350,10 @@ impl Run<'_> {
     fn record(&mut self, tag: &Advertisement) -> Result<Record, Stop> {
         let timeout = self.config.link_timeout;
         let bytes = self.retry(|radio| radio.read_record(tag.address, timeout))?;
+        let verdict = self.system.required_signers.as_ref().map(|keys| keys.judge(&bytes));
+        if let Some(verdict) = verdict.filter(|verdict| !matches!(verdict, Verdict::Trusted(_))) {
+            return Err(Stop::Signature(verdict));
+        }
         let record = vergence_tag::cbor::decode(&bytes)?;
         if record.object_id.as_str() != tag.object_id {
             let (advertised, recorded) = (tag.object_id.clone(), record.object_id.to_string());

@@ -8,6 +8,7 @@ use vergence_devices::{
 };
 use vergence_head::PanTiltHead;
 use vergence_imaging::Frame;
+use vergence_tag::signature::TrustedKeys;
 
 /// How often moving servos are asked whether they are still.
 const POLL: Duration = Duration::from_millis(10);
@@ -43,6 +44,8 @@ pub struct System {
     pub robot: Robot,
     /// Left and right head: kinematics in the base frame and the camera's lens.
     pub heads: [PanTiltHead; 2],
+    /// Whose signature a record must bear; without, unsigned records do as well.
+    pub required_signers: Option<TrustedKeys>,
     /// The arm's geometry for the planner, on robots that have an arm.
     pub hand: Option<Hand>,
 }
@@ -85,7 +88,8 @@ impl System {
                 .map_err(|source| SystemError::Description { side: side.name(), source })
         };
         let hand = robot.arm.is_some().then(|| Hand::read(description)).transpose()?;
-        Ok(System { robot, heads: [head(Side::Left)?, head(Side::Right)?], hand })
+        let heads = [head(Side::Left)?, head(Side::Right)?];
+        Ok(System { robot, heads, required_signers: None, hand })
     }
 
     /// Reads the encoders of both heads.

@@ -5,12 +5,13 @@ use std::time::Duration;
 
 use clap::{Args, Subcommand};
 use serde::Serialize;
-use vergence_devices::{DeviceError, TagAddress, TagLink};
+use vergence_devices::{DeviceError, TagAddress};
 use vergence_tag::{Pattern, Record, cbor, pattern::Bits};
 
 use crate::failure::Failure;
 use crate::radio::Radio;
 use crate::robot::RobotArgs;
+use crate::signing;
 
 /// Work on one tag: write its record, blink its light, pair with it, ask what it is.
 #[derive(Args)]
@@ -29,6 +30,8 @@ enum Action {
     Pair(Pair),
     /// Tell what a tag is and how it does.
     Info(Info),
+    /// Make a pair of keys for signing records.
+    Key(Key),
 }
 
 #[derive(Args)]
@@ -44,6 +47,9 @@ struct Write {
     /// Pair first, with a tag that has no passkey.
     #[arg(long, conflicts_with = "passkey")]
     pair: bool,
+    /// Sign the record with this private key (PEM).
+    #[arg(long, value_name = "KEY")]
+    sign: Option<PathBuf>,
     #[command(flatten)]
     robot: RobotArgs,
 }
@@ -87,6 +93,12 @@ struct Info {
     json: bool,
 }
 
+#[derive(Args)]
+struct Key {
+    /// The private key's file; the public key, for the `trusted_keys` of robots, comes beside it.
+    file: PathBuf,
+}
+
 #[derive(Serialize)]
 struct InfoOutput {
     address: String,
@@ -95,6 +107,8 @@ struct InfoOutput {
     firmware: String,
     battery: Option<u8>,
     has_record: bool,
+    /// What the record's signature says; absent when the record cannot be read.
+    signature: Option<String>,
     playing: bool,
     rssi: Option<i8>,
 }
@@ -111,12 +125,17 @@ pub fn run(args: &Tag) -> Result<bool, Failure> {
         Action::Blink(args) => blink(args),
         Action::Pair(args) => pair(args),
         Action::Info(args) => info(args),
+        Action::Key(args) => key(args),
     }
 }
 
 fn write(args: &Write) -> Result<bool, Failure> {
     let record = read_record(&args.file)?;
-    let bytes = encoded(&record, &args.file)?;
+    let mut bytes = encoded(&record, &args.file)?;
+    if let Some(path) = &args.sign {
+        let signed = signing::owner_key(path)?.sign(&bytes);
+        bytes = signed.map_err(|error| Failure::misuse(error, "use fewer vertices"))?;
+    }
     let mut radio = args.robot.open_radio()?;
     let tag = match args.to {
         // Listening tells whether the address is a public one.
@@ -168,6 +187,8 @@ fn info(args: &Info) -> Result<bool, Failure> {
     let mut radio = args.robot.open_radio()?;
     let tag = find(&mut radio, &args.id)?;
     let told = radio.link.info(tag, TIMEOUT).map_err(failed)?;
+    // A record that is not for everybody is no fault of the tag.
+    let record = radio.link.read_record(tag, TIMEOUT).ok();
     let output = InfoOutput {
         address: tag.to_string(),
         manufacturer: told.manufacturer,
@@ -175,6 +196,7 @@ fn info(args: &Info) -> Result<bool, Failure> {
         firmware: told.firmware,
         battery: told.battery,
         has_record: told.has_record,
+        signature: record.map(|bytes| radio.trusted.judge(&bytes).to_string()),
         playing: told.playing,
         rssi: told.rssi,
     };
@@ -187,8 +209,20 @@ fn info(args: &Info) -> Result<bool, Failure> {
     println!("firmware  {}", output.firmware);
     println!("battery   {}", output.battery.map_or("unknown".into(), |b| format!("{b} %")));
     println!("signal    {}", output.rssi.map_or("unknown".into(), |r| format!("{r} dBm")));
-    println!("record    {}", if output.has_record { "yes" } else { "none" });
+    let record = match (output.has_record, &output.signature) {
+        (false, _) => "none".into(),
+        (true, Some(signature)) => format!("yes, {signature}"),
+        (true, None) => "yes, not for this robot".into(),
+    };
+    println!("record    {record}");
     println!("light     {}", if output.playing { "plays" } else { "dark" });
+    Ok(true)
+}
+
+fn key(args: &Key) -> Result<bool, Failure> {
+    let public = signing::make_key(&args.file)?;
+    println!("{} signs records (`vergence tag write --sign`); keep it secret", args.file.display());
+    println!("{} goes to the `trusted_keys` of robots", public.display());
     Ok(true)
 }
 
@@ -197,7 +231,7 @@ fn bond(radio: &mut Radio, tag: TagAddress, passkey: Option<u32>) -> Result<bool
     let bond = radio.link.pair(tag, passkey).map_err(|error| {
         Failure::failed(error, "compare the passkey with the one printed on the tag; after a wrong one the tag makes every robot wait")
     })?;
-    bond.map_or(Ok(false), |bond| radio.keep(&bond))
+    bond.map_or(Ok(radio.link.keeps_bonds()), |bond| radio.keep(&bond))
 }
 
 /// The tag of an object id or an address. One id on two tags is an error: one of them is not what

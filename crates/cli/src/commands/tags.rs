@@ -4,10 +4,10 @@ use std::time::Duration;
 
 use clap::Args;
 use serde::Serialize;
-use vergence_devices::TagLink;
 use vergence_tag::Record;
 
 use crate::failure::Failure;
+use crate::radio::Radio;
 use crate::robot::RobotArgs;
 
 /// List the tags in radio range with their records.
@@ -37,27 +37,30 @@ struct Tag {
     rssi: i8,
     battery: Option<u8>,
     record: Option<Record>,
+    /// What the record's signature says.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    signature: Option<String>,
     #[serde(skip_serializing_if = "Option::is_none")]
     error: Option<String>,
 }
 
 /// Runs the command.
 pub fn run(args: &Tags) -> Result<bool, Failure> {
-    let mut radio = args.robot.open_radio()?.link;
+    let Radio { link: mut radio, trusted, .. } = args.robot.open_radio()?;
     let hint = "check the radio's driver in the configuration";
     let heard = radio.scan(WINDOW).map_err(|error| Failure::failed(error, hint))?;
     let tags: Vec<Tag> = heard
         .into_iter()
         .map(|tag| {
-            let record = radio
-                .read_record(tag.address, TIMEOUT)
-                .map_err(|error| error.to_string())
-                .and_then(|bytes| {
-                    vergence_tag::cbor::decode(&bytes).map_err(|error| error.to_string())
-                });
+            let bytes = radio.read_record(tag.address, TIMEOUT).map_err(|error| error.to_string());
+            let signature = bytes.as_ref().ok().map(|bytes| trusted.judge(bytes).to_string());
+            let record = bytes.and_then(|bytes| {
+                vergence_tag::cbor::decode(&bytes).map_err(|error| error.to_string())
+            });
             let error = record.as_ref().err().cloned();
             let (id, address) = (tag.object_id, tag.address.to_string());
-            Tag { id, address, rssi: tag.rssi, battery: tag.battery, record: record.ok(), error }
+            let (rssi, battery) = (tag.rssi, tag.battery);
+            Tag { id, address, rssi, battery, record: record.ok(), signature, error }
         })
         .collect();
     let found = !tags.is_empty();
@@ -82,7 +85,11 @@ fn print(tags: &[Tag]) {
                 let [w, l, h] = record.bounding_box.sides().map(|side| 1e3 * side);
                 let weight = record.physical.weight;
                 let weight = weight.map_or(String::new(), |kg| format!(", {:.0} g", 1e3 * kg));
-                format!("{} {w:.0} x {l:.0} x {h:.0} mm{weight}", record.semantic.name)
+                let signature = match tag.signature.as_deref() {
+                    None | Some("not signed") => String::new(),
+                    Some(verdict) => format!(", {verdict}"),
+                };
+                format!("{} {w:.0} x {l:.0} x {h:.0} mm{weight}{signature}", record.semantic.name)
             }
             (None, error) => error.clone().unwrap_or_default(),
         };

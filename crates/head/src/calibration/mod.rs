@@ -12,7 +12,8 @@
 //!
 //! **Method.** Bundle adjustment: Levenberg-Marquardt on the pixels, each weighted by centroid and
 //! encoder noise, with Cauchy weights against wrong sightings, and a Gaussian prior on every unknown of
-//! a head ([`Priors`]). The priors also hold what no light can show: moving the whole head with all
+//! a head ([`Priors`]). In the end the encoders' rounding counts as what it is, bounded by half a step,
+//! which tells half as much again of coarse servos. The priors also hold what no light can show: moving the whole head with all
 //! lights, and the directions in which the parameters of one chain repeat each other. Angles and pixels
 //! alone know no size: one known length between two places of the light, or known places (an arm that
 //! holds it), gives the scale.
@@ -197,7 +198,11 @@ impl std::fmt::Display for Missing {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum CalibrateError {
     /// The data do not determine the head; what is missing, the most important first.
-    #[error("the sightings do not determine the head: {}", list(.missing))]
+    #[error(
+        "the sightings do not determine the head, a distance of 1 m would be uncertain by {:.0} mm: {}",
+        1e3 * .distance_sigma,
+        list(.missing)
+    )]
     Unconstrained {
         /// Motions to add.
         missing: Vec<Missing>,

@@ -1,8 +1,13 @@
-//! The bundle adjustment: Levenberg-Marquardt with priors and Cauchy weights.
+//! The bundle adjustment: Levenberg-Marquardt with priors.
+//!
+//! Sightings are weighed by Cauchy's rule in three rounds. A last round takes the encoders' rounding for
+//! what it is, an error that lies anywhere within half a step but not outside (module `bounded`): its
+//! steps are Fisher's scoring, and its information is that of the predicted error.
 
 use nalgebra::{DMatrix, DVector, Matrix2, Point3, SMatrix, SVector, Vector2, Vector3};
 
 use super::{BOTH, CalibrationConfig, HEAD_UNKNOWNS, HeadVector, KnownLength, LightPlace, apply};
+use crate::bounded::Rounding;
 use crate::{Fixation, PanTiltHead};
 
 /// Residuals beyond this many sigmas lose weight (Cauchy's constant), in rounds: from the description
@@ -58,6 +63,89 @@ struct Row {
     by_light: SMatrix<f64, 2, 3>,
     weight: Matrix2<f64>,
     chi2: f64,
+    /// Joint angles by the pixel (rad/px), and the pixel's part of their variances (rad^2).
+    angles_by_pixel: Matrix2<f64>,
+    angle_variances: [f64; 2],
+}
+
+/// How much a sighting counts.
+enum Weighing {
+    /// As normal noise, less beyond this many sigmas: cost `c^2 log(1 + chi2 / c^2)`, weight its
+    /// derivative.
+    Cauchy(f64),
+    /// By the encoders' rounding.
+    Rounding(InformationTable),
+}
+
+/// A sighting as the normal equations take it.
+struct Weighed {
+    weight: Matrix2<f64>,
+    /// Minus half the derivative of the cost by the predicted pixel.
+    pull: Vector2<f64>,
+    cost: f64,
+}
+
+impl Weighing {
+    fn weigh(&self, row: &Row) -> Weighed {
+        match self {
+            Weighing::Cauchy(sigmas) => {
+                let scale = sigmas * sigmas;
+                let weight = row.weight / (1.0 + row.chi2 / scale);
+                let cost = scale * (row.chi2 / scale).ln_1p();
+                Weighed { weight, pull: weight * row.residual, cost }
+            }
+            Weighing::Rounding(table) => {
+                let errors = row.angles_by_pixel * row.residual;
+                let (mut cost, mut slopes) = (0.0, Vector2::zeros());
+                let mut information = Vector2::zeros();
+                for joint in 0..2 {
+                    let noise = row.angle_variances[joint].sqrt();
+                    let (its_cost, slope) =
+                        Rounding::new(table.step_sigma, noise).cost(errors[joint]);
+                    cost += its_cost;
+                    slopes[joint] = slope;
+                    information[joint] = table.at(noise);
+                }
+                let by_pixel = row.angles_by_pixel.transpose();
+                let weight = by_pixel * Matrix2::from_diagonal(&information) * row.angles_by_pixel;
+                Weighed { weight, pull: by_pixel * slopes, cost }
+            }
+        }
+    }
+}
+
+/// Fisher's information of a rounded angle by the noise beside the rounding.
+struct InformationTable {
+    step_sigma: f64,
+    /// For noise of this table's ratios to the step's sigma.
+    values: Vec<f64>,
+}
+
+impl InformationTable {
+    /// Logarithms of the smallest and largest ratio of noise to rounding, and entries between.
+    const RANGE: [f64; 2] = [-4.0, 4.0];
+    const ENTRIES: usize = 64;
+
+    fn new(step_sigma: f64) -> Self {
+        // A servo without steps still has some noise: a microradian.
+        let step_sigma = step_sigma.max(1e-6);
+        let [low, high] = Self::RANGE;
+        let values = (0..Self::ENTRIES).map(|i| {
+            let log = low + (high - low) * i as f64 / (Self::ENTRIES - 1) as f64;
+            Rounding::new(step_sigma, step_sigma * log.exp()).information()
+        });
+        InformationTable { step_sigma, values: values.collect() }
+    }
+
+    fn at(&self, noise: f64) -> f64 {
+        let [low, high] = Self::RANGE;
+        let place = ((noise / self.step_sigma).max(1e-9).ln().clamp(low, high) - low)
+            / (high - low)
+            * (Self::ENTRIES - 1) as f64;
+        let below = (place as usize).min(Self::ENTRIES - 2);
+        let part = place - below as f64;
+        self.values[below] * (1.0 - part) + self.values[below + 1] * part
+    }
 }
 
 impl Problem<'_> {
@@ -81,15 +169,16 @@ impl Problem<'_> {
     fn solve_from(&self, lights: Vec<Point3<f64>>) -> Option<Solution> {
         let mut state =
             State { heads: self.nominal.clone(), moved: [HeadVector::zeros(); 2], lights };
-        let mut normal = None;
+        let mut first = true;
         for (cauchy, loose) in CAUCHY.into_iter().zip(LOOSE_LENGTH) {
-            if normal.is_some() {
+            if !std::mem::take(&mut first) {
                 self.free_stray_lights(&mut state)?;
             }
-            let (better, its_normal) = self.descend(state, cauchy, loose)?;
-            (state, normal) = (better, Some(its_normal));
+            (state, _) = self.descend(state, &Weighing::Cauchy(cauchy), loose)?;
         }
-        self.finish(state, normal?)
+        let rounding = Weighing::Rounding(InformationTable::new(self.config.noise.step_sigma));
+        let (state, normal) = self.descend(state, &rounding, 0.0)?;
+        self.finish(state, normal)
     }
 
     /// Puts lights that most of their own sightings contradict back to where the rays of the head, as it
@@ -107,8 +196,13 @@ impl Problem<'_> {
     }
 
     /// Levenberg-Marquardt until the cost stands still.
-    fn descend(&self, mut state: State, cauchy: f64, loose: f64) -> Option<(State, Normal)> {
-        let mut normal = self.normal(&state, cauchy, loose)?;
+    fn descend(
+        &self,
+        mut state: State,
+        weighing: &Weighing,
+        loose: f64,
+    ) -> Option<(State, Normal)> {
+        let mut normal = self.normal(&state, weighing, loose)?;
         let mut damping = 1e-3;
         for _ in 0..MAX_ITERATIONS {
             let mut damped = normal.information.clone();
@@ -117,7 +211,7 @@ impl Problem<'_> {
             }
             let step = damped.cholesky()?.solve(&normal.gradient);
             let candidate = moved(&state, &step);
-            let trial = self.normal(&candidate, cauchy, loose).filter(|t| t.cost < normal.cost);
+            let trial = self.normal(&candidate, weighing, loose).filter(|t| t.cost < normal.cost);
             let Some(trial) = trial else {
                 damping *= 8.0;
                 if damping > 1e8 {
@@ -181,19 +275,17 @@ impl Problem<'_> {
         Some(())
     }
 
-    fn normal(&self, state: &State, cauchy: f64, loose: f64) -> Option<Normal> {
+    fn normal(&self, state: &State, weighing: &Weighing, loose: f64) -> Option<Normal> {
         let size = BOTH + 3 * state.lights.len();
         let mut information = DMatrix::zeros(size, size);
         let mut gradient = DVector::zeros(size);
         let mut cost = 0.0;
         self.for_each_row(state, |k, place, row| {
             let (head, light) = (k * HEAD_UNKNOWNS, BOTH + 3 * place);
-            // Cauchy: cost c^2 log(1 + chi2 / c^2), weight its derivative.
-            let scale = cauchy * cauchy;
-            let robust = row.weight / (1.0 + row.chi2 / scale);
-            cost += scale * (row.chi2 / scale).ln_1p();
-            let weighted_head = row.by_head.transpose() * robust;
-            let weighted_light = row.by_light.transpose() * robust;
+            let Weighed { weight, pull, cost: its_cost } = weighing.weigh(&row);
+            cost += its_cost;
+            let weighted_head = row.by_head.transpose() * weight;
+            let weighted_light = row.by_light.transpose() * weight;
             let cross = weighted_head * row.by_light;
             let mut block = information.fixed_view_mut::<HEAD_UNKNOWNS, HEAD_UNKNOWNS>(head, head);
             block += weighted_head * row.by_head;
@@ -204,9 +296,9 @@ impl Problem<'_> {
             let mut block = information.fixed_view_mut::<3, HEAD_UNKNOWNS>(light, head);
             block += cross.transpose();
             let mut part = gradient.fixed_rows_mut::<HEAD_UNKNOWNS>(head);
-            part += weighted_head * row.residual;
+            part += row.by_head.transpose() * pull;
             let mut part = gradient.fixed_rows_mut::<3>(light);
-            part += weighted_light * row.residual;
+            part += row.by_light.transpose() * pull;
         })?;
         let mut normal = Normal { information, gradient, cost };
         self.add_priors(state, &mut normal);
@@ -273,7 +365,18 @@ impl Problem<'_> {
         let weight = covariance.try_inverse()?;
         let residual = fixation.pixel - projection.pixel;
         let chi2 = residual.dot(&(weight * residual));
-        Some(Row { residual, by_head, by_light: projection.by_point, weight, chi2 })
+        let angles_by_pixel = projection.by_angles.try_inverse()?;
+        let centroid = fixation.pixel_covariance + Matrix2::identity() * 1e-6;
+        let variances = angles_by_pixel * centroid * angles_by_pixel.transpose();
+        Some(Row {
+            residual,
+            by_head,
+            by_light: projection.by_point,
+            weight,
+            chi2,
+            angles_by_pixel,
+            angle_variances: [variances[(0, 0)], variances[(1, 1)]],
+        })
     }
 }
 

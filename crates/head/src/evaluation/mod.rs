@@ -62,8 +62,12 @@ pub struct EvaluationConfig {
     pub baseline: f64,
     /// Distance of the lights (m).
     pub distance: f64,
-    /// Re-aims per head over which a measurement averages.
+    /// Most re-aims per head of one measurement: as many as a find makes.
     pub aims: usize,
+    /// Standard deviation of the distance (m) that ends the re-aims: a find's.
+    pub depth_sigma: f64,
+    /// Re-aims per head of a patient measurement.
+    pub patient_aims: usize,
     /// Centroid noise (px, one sigma, per coordinate).
     pub pixel_sigma: f64,
     /// Places of the light for the calibration, in pairs.
@@ -84,7 +88,9 @@ impl Default for EvaluationConfig {
             heads: 20,
             baseline: 0.2,
             distance: 1.0,
-            aims: 64,
+            aims: 16,
+            depth_sigma: 0.002,
+            patient_aims: 64,
             pixel_sigma: 0.1,
             places: 40,
             views: 48,
@@ -106,8 +112,12 @@ pub struct ServoFigures {
     pub refused_before: usize,
     /// Distance error (m, rms) after calibration, one fixation a head.
     pub depth_rms_single: f64,
-    /// Distance error (m, rms) after calibration, `aims` fixations a head.
+    /// Distance error (m, rms) after calibration, with the re-aims of a find.
     pub depth_rms_after: f64,
+    /// How many those were, in the mean.
+    pub mean_aims: f64,
+    /// Distance error (m, rms) after calibration, with the re-aims of a patient measurement.
+    pub depth_rms_patient: f64,
     /// Prediction of held-out sightings with all four joints moving (px, rms over both coordinates),
     /// encoder and centroid noise included.
     pub held_out_rms_px: f64,
@@ -158,6 +168,8 @@ struct Sums {
     refused_before: usize,
     single: Vec<f64>,
     after: Vec<f64>,
+    aims: Vec<f64>,
+    patient: Vec<f64>,
     covered: Vec<f64>,
     held_out: Vec<f64>,
     model: Vec<f64>,
@@ -174,6 +186,8 @@ impl Sums {
             refused_before: self.refused_before,
             depth_rms_single: rms(&self.single),
             depth_rms_after: rms(&self.after),
+            mean_aims: mean(&self.aims),
+            depth_rms_patient: rms(&self.patient),
             held_out_rms_px: rms(&self.held_out),
             model_rms_px: rms(&self.model),
             coverage: mean(&self.covered),

@@ -11,10 +11,16 @@ use crate::calibration::{
 };
 use crate::triangulation::nearest_to_rays;
 use crate::{
-    Fixation, Fixator, FixatorConfig, NextMove, Noise, PanTiltHead, dither, triangulate_many,
+    Fixation, Fixator, FixatorConfig, Landmark, NextMove, Noise, PanTiltHead, dither,
+    triangulate_many,
 };
 
 use super::{EvaluationConfig, LightSource, ServoKind, Sums};
+
+/// Re-aims between two looks at what has been reached, as in a find.
+const BATCH: usize = 4;
+/// What a find takes for unknown of the slack once it lies on one side, as a part of the stated slack.
+const OWN_SLACK_SIGMA: f64 = 0.072;
 
 /// A true head and what is believed of it.
 pub(super) struct World {
@@ -203,18 +209,28 @@ impl World {
             }
         }
         let heads = &calibration.heads;
-        let noise = Noise { common_sigma: 5e-4, ..Noise::of_servo(self.kind.step, 0.0) };
+        let common_sigma = OWN_SLACK_SIGMA * self.kind.backlash;
+        let noise = Noise { common_sigma, ..Noise::of_servo(self.kind.step, 0.0) };
         let seen = [0, 1].map(|k| self.fixate(k, &heads[k], light, config.aims, random));
-        let [left, right] = &seen;
-        let error = |left: &[Fixation], right: &[Fixation]| {
-            triangulate_many(heads, [left, right], &noise).map_or(true_distance, |l| {
-                (l.point.position - middle(heads)).norm() - true_distance
-            })
+        let from = middle(heads);
+        let landmark = |count: usize| {
+            let [left, right] = [0, 1].map(|k| &seen[k][..count.min(seen[k].len())]);
+            triangulate_many(heads, [left, right], &noise).ok()
         };
-        sums.after.push(error(left, right));
-        if let (Some(a), Some(b)) = (left.first(), right.first()) {
-            sums.single.push(error(&[*a], &[*b]));
-        }
+        let error = |landmark: Option<Landmark>| {
+            landmark.map_or(true_distance, |l| (l.point.position - from).norm() - true_distance)
+        };
+        // As a find does: until the distance is known well enough.
+        let enough = |count: usize| {
+            landmark(count).is_some_and(|l| l.distance_from(&from).1 <= config.depth_sigma)
+        };
+        let count = (BATCH..config.aims).step_by(BATCH).find(|n| enough(*n)).unwrap_or(config.aims);
+        sums.after.push(error(landmark(count)));
+        sums.aims.push(count as f64);
+        sums.single.push(error(landmark(1)));
+        let seen = [0, 1].map(|k| self.fixate(k, &heads[k], light, config.patient_aims, random));
+        let patient = triangulate_many(heads, [&seen[0], &seen[1]], &noise).ok();
+        sums.patient.push(error(patient));
         self.cover(light, calibration, sums);
     }
 

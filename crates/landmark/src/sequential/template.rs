@@ -188,21 +188,40 @@ pub fn transitions(pattern: &Pattern, times: &[(f64, f64)]) -> f64 {
 /// nuisances: any phase of any of them lies in its span, so one pass over a pixel tests all at once.
 pub fn lines(patterns: &[&Pattern], times: &[(f64, f64)], nuisance: &Nuisance) -> Vec<Vec<f32>> {
     let Some(first) = patterns.first() else { return Vec::new() };
-    let (period, n) = (first.period().as_secs_f64(), first.bits.len());
-    let mut strengths = vec![0.0f64; n.max(3)];
+    let mut strengths = vec![0.0f64; first.bits.len().max(3)];
     for pattern in patterns {
         for (s, own) in strengths.iter_mut().zip(spectrum(pattern)) {
             *s = s.max(own);
         }
     }
+    let strong = strengths.iter().enumerate().filter(|(_, s)| **s > 0.3).map(|(k, _)| k + 1);
+    orthonormal(first.period().as_secs_f64(), strong, times, |line| nuisance.remove(line))
+}
+
+/// The lines that any code of a pattern's length and chip may have, as an orthonormal set that
+/// `clear` has freed of nuisances.
+pub fn every_line(
+    pattern: &Pattern,
+    times: &[(f64, f64)],
+    clear: impl Fn(&mut [f32]),
+) -> Vec<Vec<f32>> {
+    orthonormal(pattern.period().as_secs_f64(), 1..=pattern.bits.len() / 2, times, clear)
+}
+
+/// Cosine and sine at multiples of the fundamental, orthonormal.
+fn orthonormal(
+    period: f64,
+    multiples: impl Iterator<Item = usize>,
+    times: &[(f64, f64)],
+    clear: impl Fn(&mut [f32]),
+) -> Vec<Vec<f32>> {
     let mut set: Vec<Vec<f32>> = Vec::new();
-    for (k, _) in strengths.iter().enumerate().filter(|(_, s)| **s > 0.3) {
+    for k in multiples {
         for quarter in [0.0, 0.25] {
             // The middle of the exposure is where a line's phase is read.
-            let angle =
-                |&(t, e): &(f64, f64)| TAU * ((k + 1) as f64 * (t + 0.5 * e) / period + quarter);
+            let angle = |&(t, e): &(f64, f64)| TAU * (k as f64 * (t + 0.5 * e) / period + quarter);
             let mut line: Vec<f32> = times.iter().map(|t| angle(t).cos() as f32).collect();
-            nuisance.remove(&mut line);
+            clear(&mut line);
             for other in &set {
                 let share = dot(other, &line);
                 line.iter_mut().zip(other).for_each(|(l, o)| *l -= share * o);

@@ -11,7 +11,7 @@
 
 use std::time::Duration;
 
-use nalgebra::{Matrix2, Point2};
+use nalgebra::{Matrix2, Point2, Vector2};
 
 use super::Config;
 use super::evidence::{Evidence, Series, refine, refined_gain, unexplained, weigh};
@@ -20,8 +20,9 @@ use super::history::{History, noise_share};
 use super::nuisance::{Nuisance, dot};
 use super::places::{Place, Watch};
 use super::scan::{BlockNoise, MARGIN};
+use super::spot;
 use super::surroundings::intruders;
-use super::template::{Bank, rates, transitions};
+use super::template::{Bank, every_line, rates, transitions};
 use crate::{Decision, Request, Sighting};
 
 /// Changes of the light that must have been seen: one more than a passing thing and its shadow make.
@@ -30,6 +31,12 @@ const TRANSITIONS: f64 = 5.0;
 /// Share of the explained energy that may stay unexplained beyond the noise: what phase, saturation,
 /// shake and JPEG leave of a tag's light is below a twentieth, a foreign code leaves more than a tenth.
 const MISFIT: f64 = 0.1;
+
+/// Standard deviations of chance by which another code must fit better to be believed.
+const CHANCE: f64 = 4.0;
+
+/// Degrees of freedom from which what is left over tells the noise.
+const FREE: f64 = 10.0;
 
 /// Factor on the noise of the neighbourhood before anything counts as unexplained.
 const NOISE_SLACK: f64 = 1.5;
@@ -52,6 +59,9 @@ const FLOOR_PX: f64 = 0.02;
 /// Restless places to reckon with where the picture shows none but the one in question: so many in so
 /// many pixels.
 const UNSEEN: (f64, f64) = (0.005, 640.0 * 480.0);
+
+/// Foreign codes to reckon with in a picture, however many places are restless.
+const MOST_FOREIGN: f64 = 4.0;
 
 /// Share of the presence threshold from which a pixel is looked at closer: the rest may be lost
 /// between pixels.
@@ -168,7 +178,7 @@ impl Round<'_> {
         let chips = (span / pattern.chip.as_secs_f64() + 1.0).min(frames);
         let left = chips * seen.series.freedom / frames;
         let phases = pattern.bits.len() as f64;
-        let foreign = unknown.clamp(UNSEEN.0, 1.0);
+        let foreign = unknown.clamp(UNSEEN.0, MOST_FOREIGN);
         left >= (foreign * requests * phases / self.config.wrong_identity).log2()
     }
 
@@ -335,7 +345,7 @@ impl Round<'_> {
             if kept.iter().any(ghost) || !self.stands(request, &sharp, banks) {
                 continue;
             }
-            kept.push(self.sighting(request, &sharp, pixel));
+            kept.push(self.sighting(request, &sharp));
         }
         kept.sort_by(|a, b| b.amplitude.total_cmp(&a.amplitude));
         kept
@@ -416,6 +426,9 @@ impl Round<'_> {
         if rest > MISFIT * own.correlation * own.correlation {
             return false;
         }
+        if self.is_another_code(request, seen) {
+            return false;
+        }
         let mut scratch = Vec::new();
         let others = self.requests.len() - 1;
         for other in (0..self.requests.len()).filter(|o| *o != request) {
@@ -437,23 +450,69 @@ impl Round<'_> {
         foreign.is_none_or(|evidence| evidence.log_ratio <= limit)
     }
 
-    fn sighting(&self, request: usize, seen: &Seen, pixel: Point2<f64>) -> Sighting {
+    /// Whether some other code of the same length and chip would fit much better: any such code lies in
+    /// the span of the lines of its period.
+    fn is_another_code(&self, request: usize, seen: &Seen) -> bool {
+        let (own, series) = (&seen.evidence, &seen.series);
+        let pattern = &self.requests[request].pattern;
+        let lines = every_line(pattern, self.history.times(), |line| {
+            series.clear(self.nuisance, line);
+        });
+        let free = series.freedom - lines.len() as f64;
+        let any: f64 = lines.iter().map(|l| f64::from(dot(l, &series.values)).powi(2)).sum();
+        let explained = own.correlation * own.correlation;
+        // The noise is what even the freest code leaves, as far as that can be told.
+        let rest = (series.energy - any).max(0.0);
+        let noise = if free > FREE { rest / free } else { NOISE_SLACK * series.noise };
+        let chance = (lines.len() as f64 - 1.0).max(1.0);
+        let better = any - explained - chance * noise;
+        better > (MISFIT * explained).max(CHANCE * (2.0 * chance).sqrt() * noise)
+    }
+
+    fn sighting(&self, request: usize, seen: &Seen) -> Sighting {
         let (evidence, series) = (&seen.evidence, &seen.series);
         // The larger of the noise around and of what this place leaves unexplained.
         let noise = series.noise.max(unexplained(series, evidence) / series.freedom);
         let snr = evidence.correlation / noise.sqrt();
-        // Cramer-Rao: the slope of the matched filter's output against its curvature at the peak.
-        let variance = BLOB_VARIANCE / (snr * snr) + FLOOR_PX * FLOOR_PX;
+        let (place, covariance) = self.centre(request, seen, noise);
         let period = self.requests[request].pattern.period().as_secs_f64();
         let last = self.history.times().last().map_or(0.0, |t| t.0);
         Sighting {
-            pixel,
-            covariance: Matrix2::identity() * variance,
+            pixel: self.shown(place),
+            covariance: covariance + Matrix2::identity() * (FLOOR_PX * FLOOR_PX),
             amplitude: evidence.amplitude(),
             snr,
             phase: (evidence.best.phase + evidence.best.rate * last).rem_euclid(period),
             decided_at: self.stamp,
             frames: self.frames,
+        }
+    }
+
+    /// The centre of the light and its covariance, by a fit of the spot; `noise` is that of the place.
+    fn centre(&self, request: usize, seen: &Seen, noise: f64) -> (Point2<f64>, Matrix2<f64>) {
+        let (x, y) = (seen.place.x.round(), seen.place.y.round());
+        let mut expected = Vec::new();
+        let pattern = &self.requests[request].pattern;
+        let best = (seen.evidence.best.phase, seen.evidence.best.rate);
+        seen.series.expect(pattern, self.history.times(), best, self.nuisance, &mut expected);
+        let length = seen.evidence.best.norm2.sqrt();
+        let mut raw = Vec::new();
+        let patch: [f64; spot::PIXELS] = std::array::from_fn(|k| {
+            let side = 2 * spot::HALF as usize + 1;
+            let at = |c: f64, k: usize| (c as usize + k).saturating_sub(spot::HALF as usize);
+            self.history.series_at((at(x, k % side), at(y, k / side)), &mut raw);
+            f64::from(dot(&expected, &raw)) / length
+        });
+        // Noise of the fit is that of pixels; the place between pixels has less.
+        let noise = noise / noise_share(seen.place);
+        let start = Vector2::new(seen.place.x - x, seen.place.y - y);
+        match spot::fit(&patch, start) {
+            Some(spot) => (Point2::new(x, y) + spot.offset, spot.covariance * noise),
+            // Cramer-Rao: the slope of the matched filter's output against its curvature.
+            None => {
+                let snr2 = seen.evidence.correlation.powi(2) / noise;
+                (seen.place, Matrix2::identity() * (BLOB_VARIANCE / snr2))
+            }
         }
     }
 

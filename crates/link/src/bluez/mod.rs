@@ -135,6 +135,10 @@ impl TagRadio for BluezLink {
         Err(DeviceError::Unsupported { device: self.radio.adapter.name().into(), what })
     }
 
+    fn keeps_bonds(&self) -> bool {
+        true
+    }
+
     fn release(&mut self, tag: TagAddress) -> Result<(), DeviceError> {
         self.attend(tag, &Task::Release, PROMPT).map(drop)
     }

@@ -15,7 +15,7 @@
 //! and noise make some edges far worse than others), and the offset of a part (heavy tails, as of a
 //! Student's t: a part that is seen to be far off may well be).
 
-use nalgebra::{DMatrix, DVector, Matrix6, RowVector4, SMatrix, SVector, Vector2, Vector4};
+use nalgebra::{Matrix4, Matrix6, RowVector4, SMatrix, SVector, Vector2, Vector4};
 
 use super::sites::Site;
 
@@ -23,6 +23,11 @@ use super::sites::Site;
 const SHARED: usize = 7;
 /// Unknowns of each view.
 const OWN: usize = 4;
+/// Views at most: what has a fixed size is fast.
+pub(super) const VIEWS: usize = 2;
+/// All unknowns, and those of one part: its offset and tilt (m), its offset in each view (px).
+const ALL: usize = SHARED + OWN * VIEWS;
+const PART: usize = 2 + VIEWS;
 
 /// Length of a piece (m), and the deviation of its offset from its part's (m): dents, print.
 const PIECE: f64 = 0.015;
@@ -66,9 +71,9 @@ struct Edge {
 /// each view (px).
 struct Eliminated {
     part: u32,
-    inverse: DMatrix<f64>,
-    mixed: DMatrix<f64>,
-    rhs: DVector<f64>,
+    inverse: Matrix4<f64>,
+    mixed: SMatrix<f64, ALL, PART>,
+    rhs: Vector4<f64>,
 }
 
 /// The equations while they are built.
@@ -76,8 +81,8 @@ pub(super) struct Equations {
     views: usize,
     sd_px: f64,
     doubt: f64,
-    a: DMatrix<f64>,
-    b: DVector<f64>,
+    a: SMatrix<f64, ALL, ALL>,
+    b: SVector<f64, ALL>,
     edges: Vec<Edge>,
     parts: Vec<Eliminated>,
 }
@@ -86,8 +91,12 @@ impl Equations {
     /// No measurement yet. `sd_px` is how well edges fit at this stage; `doubt` multiplies the
     /// deviations of all that sites have in common.
     pub fn new(views: usize, sd_px: f64, doubt: f64) -> Self {
-        let n = SHARED + OWN * views;
-        let (a, b) = (DMatrix::zeros(n, n), DVector::zeros(n));
+        let mut a = SMatrix::zeros();
+        // Views that are not there keep their place; their unknowns stay zero.
+        for k in SHARED + OWN * views..ALL {
+            a[(k, k)] = 1.0;
+        }
+        let b = SVector::zeros();
         Equations { views, sd_px, doubt, a, b, edges: Vec::new(), parts: Vec::new() }
     }
 
@@ -117,14 +126,12 @@ impl Equations {
     }
 
     fn part(&mut self, edges: &[Edge], offset: f64) {
-        let n = self.b.len();
-        let own = 2 + self.views;
-        let scatter: Vec<f64> = (0..self.views).map(|v| self.scatter(edges, v)).collect();
+        let scatter: [f64; VIEWS] = std::array::from_fn(|v| self.scatter(edges, v));
         let (first, last) = (edges[0].key.1, edges[edges.len() - 1].key.1);
-        let mut a = DMatrix::zeros(n + own, n + own);
-        let mut b = DVector::zeros(n + own);
-        let mut of_site = DVector::zeros(n + own);
-        let mut of_piece = DVector::zeros(n + own);
+        let mut a = SMatrix::<f64, { ALL + PART }, { ALL + PART }>::zeros();
+        let mut b = SVector::<f64, { ALL + PART }>::zeros();
+        let mut of_site = b;
+        let mut of_piece = b;
         for piece in edges.chunk_by(|a, b| a.key.1 == b.key.1) {
             // From -1 to 1 along the part.
             let place = f64::from(2 * (piece[0].key.1 - first)) / f64::from((last - first).max(1));
@@ -144,9 +151,9 @@ impl Equations {
                     residual += w * e.residual;
                 }
                 let scale = view[0].scale;
-                of_site[n] = scale;
-                of_site[n + 1] = scale * place;
-                of_site[n + 2 + v] = 1.0;
+                of_site[ALL] = scale;
+                of_site[ALL + 1] = scale * place;
+                of_site[ALL + 2 + v] = 1.0;
                 let weight = weight / scatter[v];
                 a.ger(weight, &of_site, &of_site, 1.0);
                 b.axpy(weight * residual, &of_site, 1.0);
@@ -162,7 +169,7 @@ impl Equations {
         let variance =
             (OFFSET_TAIL * edges[0].offset_sd.powi(2) + offset.powi(2)) / (OFFSET_TAIL + 1.0);
         let doubt = self.doubt * self.doubt;
-        let mut inner = a.view((n, n), (own, own)).into_owned();
+        let mut inner = a.fixed_view::<PART, PART>(ALL, ALL).into_owned();
         inner[(0, 0)] += (doubt * variance).recip();
         inner[(1, 1)] += (doubt * TILT_SD * TILT_SD).recip();
         for (v, scatter) in scatter.iter().enumerate() {
@@ -170,11 +177,11 @@ impl Equations {
             inner[(2 + v, 2 + v)] += (doubt * view).recip();
         }
         let Some(inverse) = inner.try_inverse() else { return };
-        let mixed = a.view((0, n), (n, own)).into_owned();
-        let rhs = b.rows(n, own).into_owned();
-        let lost = &mixed * &inverse;
-        self.a += a.view((0, 0), (n, n)) - &lost * mixed.transpose();
-        self.b += b.rows(0, n) - &lost * &rhs;
+        let mixed = a.fixed_view::<ALL, PART>(0, ALL).into_owned();
+        let rhs = b.fixed_rows::<PART>(ALL).into_owned();
+        let lost = mixed * inverse;
+        self.a += a.fixed_view::<ALL, ALL>(0, 0) - lost * mixed.transpose();
+        self.b += b.fixed_rows::<ALL>(0) - lost * rhs;
         self.parts.push(Eliminated { part: edges[0].key.0, inverse, mixed, rhs });
     }
 
@@ -199,7 +206,7 @@ impl Equations {
         residual: f64,
     ) {
         let at = SHARED + OWN * view;
-        let mut by = DVector::zeros(self.b.len());
+        let mut by = SVector::<f64, ALL>::zeros();
         by.fixed_rows_mut::<SHARED>(0).copy_from(js);
         by.fixed_rows_mut::<OWN>(at).copy_from(jo);
         self.a.ger(weight, &by, &by, 1.0);
@@ -242,12 +249,11 @@ impl Equations {
     pub fn solve(self) -> Option<Solution> {
         let factor = self.a.cholesky()?;
         let x = factor.solve(&self.b);
-        let mut unit = DMatrix::zeros(self.b.len(), 6);
-        unit.fill_diagonal(1.0);
+        let unit = SMatrix::<f64, ALL, 6>::identity();
         let covariance = factor.solve(&unit).fixed_view::<6, 6>(0, 0).into_owned();
         let own = (0..self.views).map(|v| x.fixed_rows::<OWN>(SHARED + OWN * v).into_owned());
         let step = Move { shared: x.fixed_rows::<SHARED>(0).into_owned(), own: own.collect() };
-        let offset = |p: &Eliminated| (&p.inverse * (&p.rhs - p.mixed.tr_mul(&x)))[0];
+        let offset = |p: &Eliminated| (p.inverse * (p.rhs - p.mixed.tr_mul(&x)))[0];
         let offsets = self.parts.iter().map(|p| (p.part, offset(p))).collect();
         Some(Solution { step, covariance, offsets })
     }

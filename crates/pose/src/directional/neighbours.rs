@@ -42,7 +42,7 @@ impl Search<'_> {
         let mut optima = vec![best.clone()];
         for start in self.starts(&best.0, &metric) {
             let mut trial = Refined { pose: start, ..best.0.clone() };
-            self.refine(&mut trial, &[Pass::new(1.0, 5.0, 3.0, true)]);
+            self.refine(&mut trial, &[Pass::new(1.0, 5.0, 4.0, true)]);
             if optima.iter().any(|o| apart(&o.0, &trial) < CAUGHT_PX) {
                 continue;
             }
