@@ -6,7 +6,8 @@
 
 Decodes every message by the definition that the file carries, checks the index against the messages,
 that recording times and stamps never go back on a topic (and grow from picture to picture), that
-pictures have the size they claim and that rotations are unit quaternions; prints a table of topics.
+pictures have the size they claim, that rotations are unit quaternions, that joint states and
+trajectories have a position for each joint, and that a trajectory starts at rest where the arm stands; prints a table of topics.
 `--topic`: must be there with at least one message. `--samples`: compare `/sample/...` messages field
 by field with `crates/ros/tests/data/samples.json`. Exit status 1 and a list when something is wrong.
 """
@@ -58,6 +59,7 @@ class Check:
     def __init__(self):
         self.problems = []
         self.topics = {}
+        self.joints = {}
 
     def wrong(self, problem):
         self.problems.append(problem)
@@ -101,6 +103,10 @@ class Check:
             self.picture(where, topic, decoded)
         if schema.name == "tf2_msgs/msg/TFMessage" and not name.startswith("/sample/"):
             self.transforms(where, topic, decoded)
+        if schema.name == "sensor_msgs/msg/JointState" and not name.startswith("/sample/"):
+            self.joint_state(where, decoded)
+        if schema.name == "trajectory_msgs/msg/JointTrajectory" and not name.startswith("/sample/"):
+            self.trajectory(where, topic, decoded)
         topic.bytes += len(message.data)
         topic.messages.append(decoded)
 
@@ -126,6 +132,27 @@ class Check:
             q = edge.transform.rotation
             if abs(q.x**2 + q.y**2 + q.z**2 + q.w**2 - 1) > 1e-6:
                 self.wrong(f"{where}: the rotation to {edge.child_frame_id} is no unit quaternion")
+
+    def joint_state(self, where, state):
+        if len(state.name) != len(state.position) or not state.name:
+            self.wrong(f"{where}: {len(state.name)} joints, {len(state.position)} positions")
+        self.joints.update(zip(state.name, state.position))
+
+    def trajectory(self, where, topic, motion):
+        names, points = list(motion.joint_names), motion.points
+        topic.note = f"{len(names)} joints"
+        times = [p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in points]
+        if not points or any(b <= a for a, b in zip(times, times[1:])):
+            self.wrong(f"{where}: {len(points)} points, times that do not rise")
+            return
+        if any(len(p.positions) != len(names) for p in points):
+            self.wrong(f"{where}: points without a position for each joint")
+            return
+        if any(abs(v) > 1e-6 for p in (points[0], points[-1]) for v in p.velocities):
+            self.wrong(f"{where}: does not start and end at rest")
+        for name, position in zip(names, points[0].positions):
+            if abs(self.joints.get(name, position) - position) > 1e-3:
+                self.wrong(f"{where}: starts with {name} at {position}, it is at {self.joints[name]}")
 
     def compare(self, samples):
         for sample in samples:

@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Replays recorded grasps in MuJoCo: does a second physics engine lift the object too?
 
-    cargo run -p vergence-physics --example cups -- 5 recordings
-    python scripts/replay_mujoco.py crates/grasp/assets/arm.urdf recordings/*.json
+    vergence experiment 2 --seeds 5 --save runs
+    python scripts/replay_mujoco.py crates/sim/assets/workcell.urdf runs/*/replay.json
 
 In: the robot's URDF (links base, hand, left_finger, right_finger) and recordings as written by
 `vergence_physics::recording`. Out: a line for each recording and exit status 1 when one was not lifted.
@@ -23,6 +23,7 @@ TABLE_FRICTION = 0.3
 FINGER_SPEED = 0.03     # m/s
 RISEN = 0.8             # part of the hand's lift that the object must rise
 HOLD = 1.0              # s
+HAND = ("hand", "left_finger", "right_finger")
 
 
 def add_solid(spec, body, solid, name, **properties):
@@ -46,6 +47,8 @@ def build(urdf, recording):
     spec = mujoco.MjSpec.from_file(urdf)
     spec.compiler.fusestatic = False
     spec.compiler.discardvisual = False
+    # The heads' links tell no mass; they hang on joints that nothing drives here.
+    spec.compiler.boundmass, spec.compiler.boundinertia = 1e-3, 1e-6
     spec.option.timestep = STEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     # Elliptic cones and many impratio: fingers hold without creeping.
@@ -53,17 +56,15 @@ def build(urdf, recording):
     spec.option.impratio = 20
     friction = recording["object"]["friction"]
     # Contact bits: robot 1, rest 2. The robot does not meet itself; its planner has seen to that.
+    # What stands still or belongs to the heads meets nothing.
     for body in spec.bodies:
         for geom in body.geoms:
-            geom.contype, geom.conaffinity = 1, 2
+            moves = body.name.startswith("arm_link") or body.name in HAND
+            geom.contype, geom.conaffinity = (1, 2) if moves else (0, 0)
             if body.name.endswith("_finger"):
                 geom.friction = [friction, 0.002, 0.0001]
                 geom.priority = 1
                 geom.condim = 4
-    # The pedestal stands on the table.
-    pedestal = spec.body("arm_base")
-    for geom in pedestal.geoms if pedestal else []:
-        geom.contype, geom.conaffinity = 0, 0
     for n, solid in enumerate(recording["obstacles"]):
         add_solid(spec, spec.worldbody, solid, f"obstacle{n}", contype=2, conaffinity=3,
                   friction=[TABLE_FRICTION, 0.002, 0.0001])

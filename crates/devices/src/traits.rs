@@ -58,11 +58,19 @@ pub trait Camera: Send {
     /// The first frame that was not delivered yet, waiting for it at most `timeout`. A camera that
     /// is read too slowly drops frames, seen as gaps in [`Frame::sequence`].
     fn next_frame(&mut self, timeout: Duration) -> Result<Frame, DeviceError>;
+
+    /// Frames whose exposure began before `since` (robot's clock) will be thrown away by the caller:
+    /// a driver to which a frame is work may leave them out.
+    fn skip_before(&mut self, _since: Duration) {}
 }
 
 impl<C: Camera + ?Sized> Camera for Box<C> {
     fn next_frame(&mut self, timeout: Duration) -> Result<Frame, DeviceError> {
         (**self).next_frame(timeout)
+    }
+
+    fn skip_before(&mut self, since: Duration) {
+        (**self).skip_before(since);
     }
 }
 

@@ -1,4 +1,4 @@
-//! Time of one plan for a box on a table: `cargo bench -p vergence-grasp`.
+//! Time of one plan for a cup on a table: `cargo bench -p vergence-grasp`.
 
 use std::path::Path;
 
@@ -22,12 +22,14 @@ fn plan(bencher: divan::Bencher) {
         Ok(Robot::new(chain, &bodies, gripper.travel, gripper.effort)?)
     };
     let Ok(robot) = make() else { return };
-    let json = r#"{"object_id": "b", "landmarks": [{"position": [-0.03, 0, 0.05], "normal": [-1, 0, 0]}],
-        "bounding_box": {"width": 0.06, "length": 0.1, "height": 0.15}, "shape": {"kind": "box"}}"#;
+    let json = r#"{"object_id": "cup", "bounding_box": {"width": 0.084, "length": 0.084, "height": 0.096},
+        "shape": {"kind": "cup", "top_diameter": 0.084, "bottom_diameter": 0.062, "height": 0.096},
+        "landmarks": [{"position": [-0.039, 0, 0.012], "normal": [-0.993498, 0, -0.113839]}],
+        "physical": {"weight": 0.28, "strength": 40.0, "material": "ceramic"}}"#;
     let Ok(record) = serde_json::from_str(json) else { return };
     let object = GaussianPose {
-        pose: Translation3::new(0.6, 0.1, 0.075).into(),
-        covariance: Matrix6::identity() * 4e-6,
+        pose: Translation3::new(0.6, 0.0, 0.048).into(),
+        covariance: Matrix6::identity() * 2.5e-6,
     };
     let table = Obstacle {
         name: "table".into(),
@@ -43,5 +45,8 @@ fn plan(bencher: divan::Bencher) {
         free_azimuths: &[],
         seed: 1,
     };
+    // A refusal would be fast.
+    let planned = vergence_grasp::plan(&robot, &request, &Config::default());
+    assert!(planned.is_ok(), "{planned:?}");
     bencher.bench_local(|| vergence_grasp::plan(&robot, &request, &Config::default()));
 }

@@ -126,6 +126,10 @@ pub fn recognise_traced<'a>(
     let rough = hypotheses.iter().map(|h| search.refine_roughly(&h.pose, h.rests)).collect();
     let rough = search.ranked(rough, config.distinct);
     let fine = search.finalists(rough).into_iter().map(|r| search.refine_finely(r)).collect();
+    let mut fine = search.ranked(fine, config.different);
+    if let Some(twins) = fine.first().map(|best| search.twins(&best.0)) {
+        fine.extend(twins);
+    }
     let mut different = search.ranked(fine, config.different);
     if let Some(best) = different.first_mut() {
         search.settle(best);
@@ -279,16 +283,10 @@ impl Search<'_> {
         kept
     }
 
-    /// Poses whose contour is the same but for the tolerance of form, with their odds against this
-    /// one: only the landmark's place can tell them apart.
-    fn twins(&self, pose: &Transform) -> Vec<(Transform, f64)> {
+    /// Poses whose contour is the same but for the tolerance of form, refined on their own: little
+    /// but the landmark's place tells them apart.
+    fn twins(&self, of: &Refined) -> Vec<(Refined, Explained)> {
         let known = self.query.symmetry();
-        let weight = self.query.landmark.covariance.try_inverse().unwrap_or_default();
-        let misfit = |p: &Transform| {
-            let seen = p.rotation * self.landmark + p.translation.vector;
-            let residual = self.query.landmark.position.coords - seen;
-            (residual.transpose() * weight * residual).x
-        };
         let stands = |p: &Transform| {
             let up = self.query.up.map_or(0.0, |up| (p.rotation * Vector3::z()).dot(&up));
             self.query.standing != Some(true) || up > 0.0
@@ -296,10 +294,14 @@ impl Search<'_> {
         self.query
             .near_symmetries()
             .into_iter()
-            .map(|s| Transform::from_parts(pose.translation, pose.rotation * s))
-            .filter(|p| known.angle_between(&p.rotation, &pose.rotation) > self.config.different)
+            .map(|s| Transform::from_parts(of.pose.translation, of.pose.rotation * s))
+            .filter(|p| known.angle_between(&p.rotation, &of.pose.rotation) > self.config.different)
             .filter(stands)
-            .map(|p| (p, (0.5 * (misfit(pose) - misfit(&p))).exp()))
+            .map(|pose| {
+                let mut twin = Refined { pose, offsets: Vec::new(), ..of.clone() };
+                self.refine(&mut twin, &[Pass::new(0.6, 4.0, 2.5, true), FINAL, FINAL]);
+                self.both(twin)
+            })
             .collect()
     }
 
@@ -309,17 +311,10 @@ impl Search<'_> {
             return Err(Refusal::NoAttitude);
         };
         let odds = |e: &Explained| (e.evidence - explained.evidence).exp();
-        let twins = self.twins(&best.pose);
-        let total = 1.0
-            + others.iter().map(|o| odds(&o.1)).sum::<f64>()
-            + twins.iter().map(|(_, odds)| odds).sum::<f64>();
+        let total = 1.0 + others.iter().map(|o| odds(&o.1)).sum::<f64>();
         let others = others.iter().map(|o| (o.0.pose, odds(&o.1)));
-        let mut alternatives: Vec<Alternative> = twins
-            .iter()
-            .copied()
-            .chain(others)
-            .map(|(pose, odds)| Alternative { pose, confidence: odds / total })
-            .collect();
+        let mut alternatives: Vec<Alternative> =
+            others.map(|(pose, odds)| Alternative { pose, confidence: odds / total }).collect();
         alternatives.sort_by(|a, b| b.confidence.total_cmp(&a.confidence));
         alternatives.truncate(MOST_ALTERNATIVES);
         let found = ObjectPose {

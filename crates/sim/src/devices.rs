@@ -60,6 +60,17 @@ impl Camera for SimCamera {
             sequence: capture.sequence,
         })
     }
+
+    /// Rendering is work.
+    fn skip_before(&mut self, since: Duration) {
+        let shutter = lock(&self.world).shutter;
+        let frames = (since.as_secs_f64() - shutter.phase) / shutter.period;
+        let mut first = (frames - 1.0).max(0.0) as u64;
+        while Duration::from_secs_f64(shutter.start(first)) < since {
+            first += 1;
+        }
+        self.next = self.next.max(first);
+    }
 }
 
 /// The servos of one head.

@@ -52,7 +52,8 @@ pub struct Shutter {
 }
 
 impl Shutter {
-    fn start(&self, frame: u64) -> f64 {
+    /// When the exposure of a frame's first row begins (s).
+    pub fn start(&self, frame: u64) -> f64 {
         self.phase + frame as f64 * self.period
     }
 

@@ -25,7 +25,7 @@ mod blink;
 mod centre;
 mod collect;
 mod reaim;
-mod search;
+pub(crate) mod search;
 
 pub use collect::{CollectConfig, CollectError, LightMover, Placed, Session, collect};
 

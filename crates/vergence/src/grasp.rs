@@ -11,16 +11,19 @@
 //! arm watches for contact while it moves and stops at the first.
 //!
 //! Success is claimed only when the gripper feels the object after the lift *and* the heads have seen
-//! the landmark move as the hand did.
+//! the landmark move as the hand did: both measure its place, or, when the hand hides it from one, the
+//! other sees it in the direction where the hand must have carried it. The second look is a correction,
+//! not a need: when the hand hides the object, the grasp stands on the first.
 
 use std::time::Duration;
 
-use nalgebra::{Translation3, Vector3};
+use nalgebra::{Point3, Translation3, Vector3};
 use vergence_devices::{
-    DeviceError, Execution, GripCommand, GripperReading, LedCommand, MotionLimits,
+    DeviceError, Execution, GripCommand, GripperReading, LedCommand, MotionLimits, Side, TagAddress,
 };
 use vergence_geometry::{GaussianPoint, Solid, Trajectory};
 use vergence_grasp::{LiftVerdict, Obstacle, Plan, Refusal, Request, correct, plan, verify_lift};
+use vergence_tag::Pattern;
 
 use crate::event::{Event, Observer};
 use crate::find::{FindConfig, Found, Run, Stop, describe};
@@ -31,6 +34,14 @@ use crate::system::{Hand, System};
 const FINGERS: Duration = Duration::from_secs(10);
 /// Longest wait for an answer of the arm's encoders.
 const ANSWER: Duration = Duration::from_secs(1);
+
+/// How far from where it was found the landmark may be seen at the second look (m).
+const SECOND_REACH: f64 = 0.06;
+/// How far from where the hand must have carried it the landmark is looked for (m): where it was before
+/// the lift, too.
+const LIFT_REACH: f64 = 0.15;
+/// How far from there one head alone may see it (m): what may slip in the fingers.
+const LIFT_PLACE: f64 = 0.02;
 
 /// Settings of a grasp.
 #[derive(Debug, Clone, Default)]
@@ -213,9 +224,17 @@ impl Attempt<'_, '_> {
         self.play("transfer", &plan.transfer, &self.config.limits.clone())
     }
 
-    /// The landmark is measured anew and the object recognised anew, from where the heads stand.
+    /// The landmark is measured anew and the object recognised anew, from where the heads stand. The
+    /// plan was sure enough of the first look, so that holds when the second gives nothing.
     fn look_again(&mut self) -> Result<Found, Failure> {
-        Ok(self.run.again(self.found)?)
+        match self.run.again(self.found) {
+            Ok(found) => Ok(found),
+            Err(Stop::Device(error)) => Err(error.into()),
+            Err(stop) => {
+                self.report.second_look = Some(stop.to_string());
+                Ok(self.found.clone())
+            }
+        }
     }
 
     fn close(&mut self, plan: &Plan) -> Result<(), Failure> {
@@ -240,9 +259,14 @@ impl Attempt<'_, '_> {
             position: motion * before.landmark.position,
             covariance: before.landmark.covariance,
         };
-        let after = self.run.measure(before.tag, &expected.position)?;
+        let sight = self.run.sight(before.tag, &expected.position)?;
         self.picture("lifted")?;
-        let verdict = verify_lift(&before.landmark, &after, &motion);
+        let (by, verdict) = match sight {
+            Sight::Place(after) => ("both heads", verify_lift(&before.landmark, &after, &motion)),
+            Sight::Direction(Side::Left) => ("left head", LiftVerdict::Held),
+            Sight::Direction(Side::Right) => ("right head", LiftVerdict::Held),
+        };
+        self.report.verified_by = Some(by);
         self.report.verified = Some(verdict == LiftVerdict::Held);
         match verdict {
             LiftVerdict::Held => Ok(()),
@@ -303,28 +327,56 @@ impl Run<'_> {
         Ok(Found { object, landmark, ..found.clone() })
     }
 
-    /// Measures where the landmark is that should be near a point (base).
-    fn measure(
-        &mut self,
-        tag: vergence_devices::TagAddress,
-        near: &nalgebra::Point3<f64>,
-    ) -> Result<GaussianPoint, Stop> {
-        Ok(self.relocate(tag, near)?.0)
+    /// Looks for the landmark where it should be (base): its place, or at least that one head sees it
+    /// in that direction.
+    fn sight(&mut self, tag: TagAddress, expected: &Point3<f64>) -> Result<Sight, Stop> {
+        self.lit(tag, |run, pattern| {
+            let seen = run.watch_near(pattern, expected, LIFT_REACH)?;
+            let there = [0, 1].map(|k| {
+                !run.within(k, seen[k].clone(), expected, LIFT_PLACE).sightings.is_empty()
+            });
+            match (run.locate_seen(tag, pattern, seen), there) {
+                (Ok((after, _)), _) => Ok(Sight::Place(after)),
+                (Err(Stop::Device(error)), _) => Err(error.into()),
+                (Err(_), [true, _]) => Ok(Sight::Direction(Side::Left)),
+                (Err(_), [_, true]) => Ok(Sight::Direction(Side::Right)),
+                (Err(stop), _) => Err(stop),
+            }
+        })
     }
 
     fn relocate(
         &mut self,
-        tag: vergence_devices::TagAddress,
-        near: &nalgebra::Point3<f64>,
+        tag: TagAddress,
+        near: &Point3<f64>,
     ) -> Result<(GaussianPoint, [[f64; 2]; 2]), Stop> {
-        // The report keeps where the landmark was found at first.
+        self.lit(tag, |run, pattern| {
+            let seen = run.watch_near(pattern, near, SECOND_REACH)?;
+            run.locate_seen(tag, pattern, seen)
+        })
+    }
+
+    /// Does something while the tag blinks. The report keeps where the landmark was found at first.
+    fn lit<T>(
+        &mut self,
+        tag: TagAddress,
+        work: impl FnOnce(&mut Self, &Pattern) -> Result<T, Stop>,
+    ) -> Result<T, Stop> {
         let first = self.landmark.clone();
         let pattern = self.start_blinking(tag)?;
-        let located = self.locate_near(tag, &pattern, near);
+        let outcome = work(self, &pattern);
         let stopped = self.command(tag, LedCommand::Stop);
         self.landmark = first;
-        let located = located?;
+        let outcome = outcome?;
         stopped?;
-        Ok(located)
+        Ok(outcome)
     }
+}
+
+/// What a look for the lifted landmark gives.
+enum Sight {
+    /// Where it is: both heads saw it.
+    Place(GaussianPoint),
+    /// This head alone saw it where it should be.
+    Direction(Side),
 }

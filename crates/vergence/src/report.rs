@@ -65,6 +65,9 @@ pub struct GraspReport {
     /// How many times over the grasp bears the pose's doubt (95 %); at least 1.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub margin: Option<f64>,
+    /// Why the second look, from the pre-grasp, gave nothing; the grasp then stands on the first.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub second_look: Option<String>,
     /// How far the second look moved the grasp (mm).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub corrected_by_mm: Option<f64>,
@@ -77,6 +80,10 @@ pub struct GraspReport {
     /// After the lift the landmark was seen where the hand must have carried it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub verified: Option<bool>,
+    /// Who saw it there: "both heads" measured its place; one head alone ("left head", "right head")
+    /// saw it in the right direction while the hand hid it from the other.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub verified_by: Option<&'static str>,
     /// What really happened, in simulation only.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub physics: Option<PhysicsReport>,

@@ -160,6 +160,7 @@ impl System {
 
     /// The next picture of one head whose exposure began at or after `since`.
     pub fn frame_since(&mut self, side: usize, since: Duration) -> Result<Frame, DeviceError> {
+        self.robot.heads[side].camera.skip_before(since);
         for _ in 0..STALE_FRAMES {
             let frame = self.robot.heads[side].camera.next_frame(FRAME_TIMEOUT)?;
             if frame.stamp >= since {

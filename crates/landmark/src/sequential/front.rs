@@ -10,6 +10,9 @@ use vergence_imaging::Image;
 /// Half the side of the filter's support (px).
 pub const REACH: usize = 3;
 
+/// Standard deviation of the image of a light (px).
+pub const LIGHT_PX: f64 = 0.68;
+
 /// Filter output per grey level of a light whose image is a Gaussian of 0.68 px on a pixel centre.
 pub const GAIN: f32 = 12.03;
 
@@ -20,18 +23,18 @@ pub const BOX_SHARE: f64 = 1.42 / 12.03;
 pub const NOISE_GAIN: f32 = 10.4;
 
 /// Variance (px^2) of the blob that a point light makes in the filtered image.
-pub const BLOB_VARIANCE: f64 = 2.0 * 0.68 * 0.68;
+pub const BLOB_VARIANCE: f64 = 2.0 * LIGHT_PX * LIGHT_PX;
 
-/// Covariance of the filter output between two pixels that lie `dx` and `dy` (px, up to 3) apart,
+/// Covariance of the filter output between two pixels that lie `dx` and `dy` (px, up to 4) apart,
 /// relative to its variance, when the noise of the pixels is white.
 pub fn noise_correlation(dx: usize, dy: usize) -> f32 {
     // Peak with peak, peak with box, box with box: all are products of one dimension each.
-    const PEAK: [f32; 4] = [11.0, 6.0, 1.0, 0.0];
-    const CROSS: [f32; 4] = [5.0, 5.0, 5.0, 4.0];
-    const BOX: [f32; 4] = [7.0, 6.0, 5.0, 4.0];
+    const PEAK: [f32; 5] = [11.0, 6.0, 1.0, 0.0, 0.0];
+    const CROSS: [f32; 5] = [5.0, 5.0, 5.0, 4.0, 1.0];
+    const BOX: [f32; 5] = [7.0, 6.0, 5.0, 4.0, 3.0];
     let level = 25.0 / 49.0;
     let at = |x: usize, y: usize| {
-        let product = |of: &[f32; 4]| of[x.min(3)] * of[y.min(3)];
+        let product = |of: &[f32; 5]| of[x.min(4)] * of[y.min(4)];
         product(&PEAK) - 2.0 * level * product(&CROSS) + level * level * product(&BOX)
     };
     at(dx, dy) / at(0, 0)

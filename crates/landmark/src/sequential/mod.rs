@@ -26,6 +26,7 @@ pub mod nuisance;
 pub mod places;
 pub mod scan;
 pub mod shift;
+pub mod spot;
 pub mod surroundings;
 pub mod template;
 mod verdict;

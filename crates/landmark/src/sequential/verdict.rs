@@ -11,7 +11,7 @@
 
 use std::time::Duration;
 
-use nalgebra::{Matrix2, Point2};
+use nalgebra::{Matrix2, Point2, Vector2};
 
 use super::Config;
 use super::evidence::{Evidence, Series, refine, refined_gain, unexplained, weigh};
@@ -20,6 +20,7 @@ use super::history::{History, noise_share};
 use super::nuisance::{Nuisance, dot};
 use super::places::{Place, Watch};
 use super::scan::{BlockNoise, MARGIN};
+use super::spot;
 use super::surroundings::intruders;
 use super::template::{Bank, every_line, rates, transitions};
 use crate::{Decision, Request, Sighting};
@@ -57,7 +58,7 @@ const FLOOR_PX: f64 = 0.02;
 
 /// Restless places to reckon with where the picture shows none but the one in question: so many in so
 /// many pixels.
-const UNSEEN: (f64, f64) = (0.005, 640.0 * 480.0);
+const UNSEEN: (f64, f64) = (0.002, 640.0 * 480.0);
 
 /// Foreign codes to reckon with in a picture, however many places are restless.
 const MOST_FOREIGN: f64 = 4.0;
@@ -344,7 +345,7 @@ impl Round<'_> {
             if kept.iter().any(ghost) || !self.stands(request, &sharp, banks) {
                 continue;
             }
-            kept.push(self.sighting(request, &sharp, pixel));
+            kept.push(self.sighting(request, &sharp));
         }
         kept.sort_by(|a, b| b.amplitude.total_cmp(&a.amplitude));
         kept
@@ -428,6 +429,7 @@ impl Round<'_> {
         if self.is_another_code(request, seen) {
             return false;
         }
+        let series = &series.settled(&own);
         let mut scratch = Vec::new();
         let others = self.requests.len() - 1;
         for other in (0..self.requests.len()).filter(|o| *o != request) {
@@ -468,23 +470,50 @@ impl Round<'_> {
         better > (MISFIT * explained).max(CHANCE * (2.0 * chance).sqrt() * noise)
     }
 
-    fn sighting(&self, request: usize, seen: &Seen, pixel: Point2<f64>) -> Sighting {
+    fn sighting(&self, request: usize, seen: &Seen) -> Sighting {
         let (evidence, series) = (&seen.evidence, &seen.series);
         // The larger of the noise around and of what this place leaves unexplained.
         let noise = series.noise.max(unexplained(series, evidence) / series.freedom);
         let snr = evidence.correlation / noise.sqrt();
-        // Cramer-Rao: the slope of the matched filter's output against its curvature at the peak.
-        let variance = BLOB_VARIANCE / (snr * snr) + FLOOR_PX * FLOOR_PX;
+        let (place, covariance) = self.centre(request, seen, noise);
         let period = self.requests[request].pattern.period().as_secs_f64();
         let last = self.history.times().last().map_or(0.0, |t| t.0);
         Sighting {
-            pixel,
-            covariance: Matrix2::identity() * variance,
+            pixel: self.shown(place),
+            covariance: covariance + Matrix2::identity() * (FLOOR_PX * FLOOR_PX),
             amplitude: evidence.amplitude(),
             snr,
             phase: (evidence.best.phase + evidence.best.rate * last).rem_euclid(period),
             decided_at: self.stamp,
             frames: self.frames,
+        }
+    }
+
+    /// The centre of the light and its covariance, by a fit of the spot; `noise` is that of the place.
+    fn centre(&self, request: usize, seen: &Seen, noise: f64) -> (Point2<f64>, Matrix2<f64>) {
+        let (x, y) = (seen.place.x.round(), seen.place.y.round());
+        let mut expected = Vec::new();
+        let pattern = &self.requests[request].pattern;
+        let best = (seen.evidence.best.phase, seen.evidence.best.rate);
+        seen.series.expect(pattern, self.history.times(), best, self.nuisance, &mut expected);
+        let length = seen.evidence.best.norm2.sqrt();
+        let mut raw = Vec::new();
+        let patch: [f64; spot::PIXELS] = std::array::from_fn(|k| {
+            let side = 2 * spot::HALF as usize + 1;
+            let at = |c: f64, k: usize| (c as usize + k).saturating_sub(spot::HALF as usize);
+            self.history.series_at((at(x, k % side), at(y, k / side)), &mut raw);
+            f64::from(dot(&expected, &raw)) / length
+        });
+        // Noise of the fit is that of pixels; the place between pixels has less.
+        let noise = noise / noise_share(seen.place);
+        let start = Vector2::new(seen.place.x - x, seen.place.y - y);
+        match spot::fit(&patch, start) {
+            Some(spot) => (Point2::new(x, y) + spot.offset, spot.covariance * noise),
+            // Cramer-Rao: the slope of the matched filter's output against its curvature.
+            None => {
+                let snr2 = seen.evidence.correlation.powi(2) / noise;
+                (seen.place, Matrix2::identity() * (BLOB_VARIANCE / snr2))
+            }
         }
     }
 

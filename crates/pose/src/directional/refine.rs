@@ -46,6 +46,8 @@ pub fn absence(kind: Kind) -> f64 {
     }
 }
 
+/// Deviation of the light's place on the object from the record's (m): tags are stuck on by hand.
+const PLACE_SD: f64 = 0.001;
 /// Deviation of the pixel where a camera saw the landmark, lobe and housing included (px).
 const LANDMARK_SD_PX: f64 = 0.3;
 /// Thickness of the lip of an open rim (m), and its deviation.
@@ -247,8 +249,9 @@ impl Search<'_> {
     }
 
     /// What the landmark's measurement is worth as a point (1/m^2).
-    fn landmark_weight(&self) -> Matrix3<f64> {
-        self.query.landmark.covariance.try_inverse().unwrap_or_default()
+    pub(super) fn landmark_weight(&self) -> Matrix3<f64> {
+        let place = Matrix3::identity() * (PLACE_SD * PLACE_SD);
+        (self.query.landmark.covariance + place).try_inverse().unwrap_or_default()
     }
 
     /// Information and right-hand side of the landmark, of gravity and of the size.

@@ -59,32 +59,51 @@ impl Run<'_> {
         Ok(held.map(|(joints, sighting)| fixation(&joints, &sighting)))
     }
 
-    /// Looks at a place where the light should be, centres it and measures where it is; gives the
-    /// heads' angles too.
-    pub(crate) fn locate_near(
+    /// Looks with both heads at a place where the light should be: what each sees no further than
+    /// `reach` (m) from it. Mirrors and what the hand reflects lie further away.
+    pub(crate) fn watch_near(
+        &mut self,
+        pattern: &Pattern,
+        near: &Point3<f64>,
+        reach: f64,
+    ) -> Result<[Seen; 2], Stop> {
+        let targets = [0, 1].map(|k| self.system.heads[k].look_at(near));
+        let joints = self.system.turn(targets)?;
+        let [left, right] = self.watch(pattern, joints.map(Some))?;
+        let seen = [(0, left), (1, right)].map(|(k, sightings)| {
+            let seen = Seen { joints: joints[k], sightings };
+            self.within(k, seen, near, reach)
+        });
+        Ok(seen)
+    }
+
+    /// What a head saw no further than `reach` (m) from a place.
+    pub(crate) fn within(&self, side: usize, seen: Seen, near: &Point3<f64>, reach: f64) -> Seen {
+        let head = &self.system.heads[side];
+        let angles = [seen.joints.pan, seen.joints.tilt];
+        let noise = self.noise();
+        let sigma = noise.step_sigma.hypot(noise.common_sigma);
+        let eye = head.base_from_optical(angles).translation.vector;
+        let radius = head.camera.fx * (reach / (near.coords - eye).norm() + 3.0 * sigma);
+        let expected = head.project(angles, near);
+        let keep = |s: &Sighting| expected.is_some_and(|e| (s.pixel - e).norm() <= radius);
+        Seen { sightings: seen.sightings.into_iter().filter(keep).collect(), ..seen }
+    }
+
+    /// Centres and measures a light that both heads saw; gives the heads' angles too.
+    pub(crate) fn locate_seen(
         &mut self,
         tag: TagAddress,
         pattern: &Pattern,
-        near: &Point3<f64>,
+        seen: [Seen; 2],
     ) -> Result<(GaussianPoint, [[f64; 2]; 2]), Stop> {
-        let targets = [0, 1].map(|k| self.system.heads[k].look_at(near));
-        let joints = self.system.turn(targets)?;
-        let sightings = self.watch(pattern, joints.map(Some))?;
-        let missing = [0, 1].map(|k| sightings[k].is_empty());
-        if missing != [false, false] {
-            let missing = match missing {
-                [true, true] => Missing::Either,
-                [true, false] => Missing::One(Side::Left),
-                _ => Missing::One(Side::Right),
-            };
-            return Err(Stop::NotSeen { views: 2, missing });
-        }
-        let [left, right] = sightings;
-        let seen = [
-            Seen { joints: joints[0], sightings: left },
-            Seen { joints: joints[1], sightings: right },
-        ];
-        self.fixate(tag, pattern, seen)
+        let missing = match [0, 1].map(|k| seen[k].sightings.is_empty()) {
+            [false, false] => return self.fixate(tag, pattern, seen),
+            [true, true] => Missing::Either,
+            [true, false] => Missing::One(Side::Left),
+            [false, true] => Missing::One(Side::Right),
+        };
+        Err(Stop::NotSeen { views: 2, missing })
     }
 
     /// Of all places that either head saw, the pair that can be one light: the brightest whose lines

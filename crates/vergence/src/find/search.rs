@@ -9,11 +9,11 @@ use super::{Missing, Run, Stop};
 
 /// Where one head saw the light, at which angles.
 #[derive(Debug, Clone)]
-pub(super) struct Seen {
+pub(crate) struct Seen {
     /// The head's angles.
-    pub(super) joints: JointReading,
+    pub(crate) joints: JointReading,
     /// All places, brightest first; a mirror shows the light a second time.
-    pub(super) sightings: Vec<Sighting>,
+    pub(crate) sightings: Vec<Sighting>,
 }
 
 impl Run<'_> {

@@ -1,0 +1,113 @@
+//! `vergence grasp` as outsiders script against it: the contract, a grasp from start to end, and
+//! refusals by name.
+
+// Helpers outside of test functions fail a test by panicking, too.
+#![allow(clippy::unwrap_used)]
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use serde_json::Value;
+
+fn vergence(args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_vergence")).args(args).output().unwrap()
+}
+
+/// A workcell of this test's own; `cup` changes what is written of the cup.
+fn workcell(name: &str, cup: impl Fn(&str) -> String) -> PathBuf {
+    let dir = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
+    let _ = std::fs::remove_dir_all(&dir);
+    assert!(vergence(&["workcell", dir.to_str().unwrap()]).status.success());
+    let path = dir.join("workcell.toml");
+    let text = std::fs::read_to_string(&path).unwrap();
+    let text = text.replace("scenario = \"default\"", "scenario = \"reach\"");
+    let (before, after) = text.split_once("object_id = \"cup\"").unwrap();
+    std::fs::write(&path, format!("{before}object_id = \"cup\"{}", cup(after))).unwrap();
+    path
+}
+
+fn grasp(config: &Path, more: &[&str]) -> (Option<i32>, Value) {
+    let config = config.to_str().unwrap();
+    let args = [&["grasp", "cup", "--config", config, "--json"], more].concat();
+    let output = vergence(&args);
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    let report = serde_json::from_slice(&output.stdout).unwrap_or_else(|e| panic!("{e}: {said}"));
+    (output.status.code(), report)
+}
+
+#[test]
+fn a_cup_is_found_grasped_and_lifted() {
+    let path = workcell("grasp", |cup| cup.into());
+    let save = path.with_file_name("saved");
+    let (status, report) = grasp(&path, &["--save", save.to_str().unwrap()]);
+    assert_eq!(status, Some(0), "{report}");
+    let grasp = &report["grasp"];
+    assert_eq!(grasp["succeeded"], true, "{grasp}");
+    assert_eq!(grasp["verified"], true, "the heads saw the landmark rise: {grasp}");
+    assert_eq!(grasp["approach"], "rim", "nobody tells whether the cup has a handle");
+    assert!(grasp["margin"].as_f64().unwrap() >= 1.0, "{grasp}");
+    assert!(grasp["width"].as_f64().unwrap() > 0.0 && grasp["force"].as_f64().unwrap() > 0.0);
+    assert_eq!(grasp["physics"]["lifted"], true, "the robot's word is true: {grasp}");
+    assert!(grasp["physics"]["collision"].is_null(), "{grasp}");
+    let steps: Vec<&str> = report["timeline"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|s| s["step"].as_str().unwrap())
+        .collect();
+    let order = [
+        "recognise",
+        "plan",
+        "transfer",
+        "look again",
+        "correct",
+        "approach",
+        "close",
+        "lift",
+        "verify",
+    ];
+    let places: Vec<usize> =
+        order.iter().map(|step| steps.iter().position(|s| s == step).unwrap()).collect();
+    assert!(places.is_sorted(), "{steps:?}");
+    for name in ["stages.png", "7-pregrasp-left.png", "7-closed-right.png", "7-lifted-left.png"] {
+        vergence_imaging::codec::read(&save.join(name)).unwrap();
+    }
+    let reader = vergence_ros::recording::Reader::open(&save.join("recording.mcap")).unwrap();
+    let trajectories = reader.topics().iter().find(|t| t.name == "/arm/joint_trajectory").unwrap();
+    assert_eq!(trajectories.messages, 4, "transfer, correction, approach, lift");
+    let replay = std::fs::read(save.join("replay.json")).unwrap();
+    let replay: Value = serde_json::from_slice(&replay).unwrap();
+    assert_eq!(replay["motions"].as_array().unwrap().len(), 6);
+}
+
+#[test]
+fn what_must_not_or_cannot_be_lifted_is_refused_by_name() {
+    let fixed = workcell("fixed", |cup| cup.replacen("\"movable\"", "\"fixed\"", 1));
+    refused(&fixed, "is fixed");
+    let heavy = workcell("heavy", |cup| cup.replacen("weight = 0.28", "weight = 9.0", 1));
+    refused(&heavy, "weighs 9.00 kg");
+}
+
+/// The arm must not have moved, and the message must say why.
+fn refused(path: &Path, said: &str) {
+    let (status, report) = grasp(path, &[]);
+    assert_eq!(status, Some(1), "{report}");
+    assert_eq!(report["found"], true, "{report}");
+    let grasp = &report["grasp"];
+    assert_eq!(grasp["succeeded"], false);
+    assert!(grasp["reason"].as_str().unwrap().contains(said), "{grasp}");
+    assert!(!grasp["hint"].as_str().unwrap().is_empty());
+    let moved = |step: &Value| step["step"] == "transfer";
+    assert!(!report["timeline"].as_array().unwrap().iter().any(moved), "{report}");
+    assert_eq!(grasp["physics"]["risen_mm"].as_f64().map(f64::abs).map(|mm| mm < 1.0), Some(true));
+}
+
+#[test]
+fn an_object_that_nobody_knows_is_not_grasped() {
+    let output = vergence(&["grasp", "teapot", "--json"]);
+    assert_eq!(output.status.code(), Some(1));
+    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert!(report["reason"].as_str().unwrap().contains("teapot"));
+    assert_eq!(report["grasp"]["succeeded"], false);
+    assert_eq!(vergence(&["grasp"]).status.code(), Some(2));
+}
