@@ -170,6 +170,8 @@ fn document(
                 "held_out_rms_px": f.held_out_rms_px,
                 "model_rms_px": f.model_rms_px,
                 "calibration_coverage": f.coverage,
+                "coverage_trials": config.trials,
+                "refused_trials": f.refused_trials,
                 "refused_calibrations": f.refused_calibrations,
             })
         })
@@ -209,7 +211,8 @@ fn print_table(config: &EvaluationConfig, figures: &[ServoFigures], timing: &Tim
     row(&patient, "mm", &|f| 1e3 * f.depth_rms_patient);
     row("prediction of held-out views, rms", "px", &|f| f.held_out_rms_px);
     row("  without encoder and pixel noise", "px", &|f| f.model_rms_px);
-    row("within the predicted 95 % interval", "%", &|f| 100.0 * f.coverage);
+    let trials = format!("within the predicted 95 %, {} heads", config.trials);
+    row(&trials, "%", &|f| 100.0 * f.coverage);
     row("calibrations refused", "of all", &|f| f.refused_calibrations as f64);
     println!(
         "time to fixation over (slew + code), median: {:.2} last seen within 0.1 m, {:.2} in sight, \

@@ -74,6 +74,8 @@ pub struct EvaluationConfig {
     pub places: usize,
     /// Sightings by each head of each place: with 40 places some ten minutes of a real head's time.
     pub views: usize,
+    /// Trials of the predicted error: short calibrations (20 places, 24 sightings each) of other heads.
+    pub trials: usize,
     /// How the light of the calibration is moved.
     pub light: LightSource,
     /// Seed.
@@ -94,6 +96,7 @@ impl Default for EvaluationConfig {
             pixel_sigma: 0.1,
             places: 40,
             views: 48,
+            trials: 100,
             light: LightSource::Ruler,
             seed: 1,
         }
@@ -123,11 +126,13 @@ pub struct ServoFigures {
     pub held_out_rms_px: f64,
     /// The same against the true projection: the calibration's own error.
     pub model_rms_px: f64,
-    /// Part of the lights whose distance error, free of measurement noise, lies within the predicted
-    /// 95 % interval.
+    /// Part of the trials, each with a head and a short calibration of its own, in which the distance
+    /// error, free of measurement noise, lies within the predicted 95 % interval.
     pub coverage: f64,
     /// Heads that the calibration refused.
     pub refused_calibrations: usize,
+    /// Trials of the predicted error whose short calibration was refused.
+    pub refused_trials: usize,
 }
 
 /// Evaluates both kinds of servo.
@@ -140,13 +145,13 @@ pub fn evaluate_kind(kind: &ServoKind, config: &EvaluationConfig) -> ServoFigure
     let mut random = Pcg64Mcg::seed_from_u64(config.seed);
     let mut sums = Sums::default();
     let heads = config.heads.clamp(1, config.placements.max(1));
+    let settings = CalibrationConfig {
+        noise: Noise::of_servo(kind.step, 0.0),
+        ..CalibrationConfig::default()
+    };
     for h in 0..heads {
         let world = World::draw(kind, config, &mut random);
         let session = world.session(config, &mut random);
-        let settings = CalibrationConfig {
-            noise: Noise::of_servo(kind.step, 0.0),
-            ..CalibrationConfig::default()
-        };
         let calibration = calibrate(&world.nominal, &session.places, &session.lengths, &settings);
         let share = config.placements / heads + usize::from(h < config.placements % heads);
         let Ok(calibration) = calibration else {
@@ -157,6 +162,20 @@ pub fn evaluate_kind(kind: &ServoKind, config: &EvaluationConfig) -> ServoFigure
         for _ in 0..share {
             let light = world.new_light(config.distance, &mut random);
             world.measure(&light, &calibration, config, &mut random, &mut sums);
+        }
+    }
+    // A calibration errs alike for all lights, so every trial of its prediction has a head of its own.
+    let short = EvaluationConfig { places: 20, views: 24, ..*config };
+    for _ in 0..config.trials {
+        let world = World::draw(kind, config, &mut random);
+        let session = world.session(&short, &mut random);
+        let calibrated = calibrate(&world.nominal, &session.places, &session.lengths, &settings);
+        match calibrated {
+            Ok(calibration) => {
+                let light = world.new_light(config.distance, &mut random);
+                world.cover(&light, &calibration, &mut sums);
+            }
+            Err(_) => sums.refused_trials += 1,
         }
     }
     sums.figures(*kind)
@@ -174,6 +193,7 @@ struct Sums {
     held_out: Vec<f64>,
     model: Vec<f64>,
     refused_calibrations: usize,
+    refused_trials: usize,
 }
 
 impl Sums {
@@ -192,6 +212,7 @@ impl Sums {
             model_rms_px: rms(&self.model),
             coverage: mean(&self.covered),
             refused_calibrations: self.refused_calibrations,
+            refused_trials: self.refused_trials,
         }
     }
 }

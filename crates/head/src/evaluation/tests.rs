@@ -26,7 +26,7 @@ fn drawn(seed: u64, light: LightSource) -> (World, Session, CalibrationConfig) {
 
 #[test]
 fn calibration_turns_decimetres_into_millimetres_and_knows_its_error() {
-    let config = EvaluationConfig { placements: 16, heads: 4, aims: 16, ..small() };
+    let config = EvaluationConfig { placements: 16, heads: 4, trials: 12, ..small() };
     let figures = evaluate_kind(&SERVO_KINDS[1], &config);
     assert!(figures.depth_rms_before > 0.05, "{figures:?}");
     assert!(figures.depth_rms_after < 0.005, "{figures:?}");

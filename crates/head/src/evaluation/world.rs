@@ -231,7 +231,6 @@ impl World {
         let seen = [0, 1].map(|k| self.fixate(k, &heads[k], light, config.patient_aims, random));
         let patient = triangulate_many(heads, [&seen[0], &seen[1]], &noise).ok();
         sums.patient.push(error(patient));
-        self.cover(light, calibration, sums);
     }
 
     /// Distance by the description, from the point nearest to all rays; `None` when that is behind.
@@ -245,7 +244,7 @@ impl World {
     }
 
     /// Distance error of noise-free sightings against what the calibration predicts of itself.
-    fn cover(&self, light: &Point3<f64>, calibration: &Calibration, sums: &mut Sums) {
+    pub(super) fn cover(&self, light: &Point3<f64>, calibration: &Calibration, sums: &mut Sums) {
         let slack = self.kind.backlash / 2.0;
         let rays = [0, 1].map(|k| {
             // The slack from one side is part of the calibrated zero: encoders tell more by half.
