@@ -220,25 +220,28 @@ impl Round<'_> {
         }
     }
 
-    /// Weighs every watch that is due; whether any reached the floor, for every request.
+    /// Weighs every watch that is due; whether any reached the floor, for every request. Request by
+    /// request, as a bank fits the cache and all banks together do not.
     fn weigh_due(&self, places: &mut [Place], banks: &mut Banks, thorough: bool) -> Vec<bool> {
-        let mut near = vec![false; self.requests.len()];
+        let is_due = |w: &Watch| thorough || w.due <= self.frames;
         let (mut raw, mut scratch) = (Vec::new(), Vec::new());
-        for place in places {
-            if !thorough && place.watches.iter().all(|w| w.due > self.frames) {
-                continue;
+        let mut due = Vec::new();
+        for (p, place) in places.iter().enumerate() {
+            if place.watches.iter().any(is_due) {
+                self.history.series_at(place.pixel, &mut raw);
+                due.push((p, self.series_of(place.pixel, &raw)));
             }
-            self.history.series_at(place.pixel, &mut raw);
-            let series = self.series_of(place.pixel, &raw);
-            for watch in &mut place.watches {
-                if !thorough && watch.due > self.frames {
-                    continue;
-                }
-                let bank = banks.own(self, watch.request);
-                let evidence = weigh(&series, bank, self.floor(), &mut scratch);
+        }
+        let mut near = vec![false; self.requests.len()];
+        for (request, near) in near.iter_mut().enumerate() {
+            for (p, series) in &due {
+                let own = |w: &&mut Watch| w.request == request && is_due(w);
+                let Some(watch) = places[*p].watches.iter_mut().find(own) else { continue };
+                let bank = banks.own(self, request);
+                let evidence = weigh(series, bank, self.floor(), &mut scratch);
                 watch.level = evidence.map_or(0.0, |e| e.log_ratio);
                 watch.due = self.due(watch.level, self.floor(), self.frames / 4);
-                near[watch.request] |= watch.level >= self.floor();
+                *near |= watch.level >= self.floor();
             }
         }
         near
