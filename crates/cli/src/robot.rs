@@ -106,9 +106,7 @@ impl RobotArgs {
                 let trusted = signing::trusted(&config, folder(path))?;
                 (self.workcell(path, &config, &description)?, trusted)
             }
-            None => {
-                (Workcell::embedded(self.seed).map_err(unusable)?, TrustedKeys::default())
-            }
+            None => (Workcell::embedded(self.seed).map_err(unusable)?, TrustedKeys::default()),
         };
         Ok(Radio::simulated(&workcell, trusted))
     }
