@@ -6,7 +6,8 @@
 #     scripts/qemu_bluez.sh
 #
 # Needs Debian (or a relative with the package linux-image-amd64); as root it installs what is
-# missing, else it says what is. About a minute, four at most, and what the build takes. Skips with a message where it cannot run.
+# missing, else it says what is. About a minute, four at most, and what the build takes. Skips with a
+# message where it cannot run.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 . scripts/qemu_guest.sh
@@ -28,7 +29,7 @@ trap 'kill $server; rm -f "$tags"' EXIT
 until grep -q 'tags on' "$tags"; do sleep 0.1; done
 port=$(sed -n 's/tags on .*:\([0-9]*\)$/\1/p' "$tags")
 
-guest_run "$guest/bluez" 220 -chardev "socket,id=hci,host=127.0.0.1,port=$port,nodelay=on" \
+guest_run "$guest/bluez" 260 -chardev "socket,id=hci,host=127.0.0.1,port=$port,nodelay=on" \
   -serial chardev:hci <<'INIT'
 # The kernel pairs with these. The order matters: each tests itself with those before it.
 for module in hmac sha512_generic ctr ecb cmac jitterentropy_rng drbg ecdh_generic algif_hash \
@@ -49,14 +50,14 @@ cat >/etc/dbus.conf <<CONF
 CONF
 dbus-daemon --config-file=/etc/dbus.conf --nopidfile --fork
 btattach -B /dev/ttyS1 -P h4 >/dev/null 2>&1 &
-bluetoothd -n >/tmp/bluetoothd.log 2>&1 &
+bluetoothd -n >/run/bluetoothd.log 2>&1 &
 for second in 1 2 3 4 5 6 7 8 9 10; do
   [ -e /sys/class/bluetooth/hci0 ] && break
   sleep 1
 done
 sleep 2
 echo "# BlueZ $(bluetoothd --version)"
-if timeout 150 bluez_probe bluez; then result=passed; else result=failed; cat /tmp/bluetoothd.log; fi
+if timeout 160 bluez_probe bluez; then result=passed; else result=failed; cat /run/bluetoothd.log; fi
 kill $(pidof bluetoothd)
 sleep 1
 btmgmt --index 0 power off >/dev/null 2>&1 </dev/null

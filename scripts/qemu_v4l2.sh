@@ -4,7 +4,8 @@
 #     scripts/qemu_v4l2.sh
 #
 # Needs Debian (or a relative with the package linux-image-amd64); as root it installs what is
-# missing, else it says what is. Half a minute, three at most. Skips with a message where it cannot run.
+# missing, else it says what is. Half a minute, two at most, and what the build takes. Skips with a
+# message where it cannot run.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 . scripts/qemu_guest.sh
@@ -13,9 +14,9 @@ guest_need qemu-system-x86_64=qemu-system-x86 busybox=busybox-static cpio=cpio v
 guest_kernel
 cargo build -q --locked -p vergence-devices --example v4l2_probe
 guest_files "$guest/v4l2" vivid -- v4l2-ctl target/debug/examples/v4l2_probe
-guest_run "$guest/v4l2" 150 <<'INIT'
+guest_run "$guest/v4l2" 120 <<'INIT'
 # One camera of the kind "webcam" with a picture that stands still, stamped at the start of exposure.
 modprobe vivid n_devs=1 node_types=0x1 num_inputs=1 input_types=0x0
 v4l2-ctl -d /dev/video0 --set-ctrl osd_text_mode=2,test_pattern=0,timestamp_source=1
-if timeout 120 v4l2_probe /dev/video0; then echo 'guest: passed'; else echo 'guest: failed'; fi
+if timeout 100 v4l2_probe /dev/video0; then echo 'guest: passed'; else echo 'guest: failed'; fi
 INIT

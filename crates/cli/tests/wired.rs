@@ -14,7 +14,7 @@ use serde_json::Value;
 use vergence_sim::{WiredWorkcell, Workcell, embedded_files, fitting_servo, settings};
 
 /// No run may take longer, whatever happens to its devices.
-const BOUND: Duration = Duration::from_secs(60);
+const BOUND: Duration = Duration::from_secs(180);
 /// Into the search, when the servos move: the radio alone listens for 2.5 s.
 const UNDER_WAY: Duration = Duration::from_millis(4500);
 

@@ -134,6 +134,31 @@ fn a_standing_box_is_found_with_gravity() {
 }
 
 #[test]
+fn the_covariance_holds_the_truth_and_is_not_wide() {
+    // 95 % points of chi-squared with six degrees of freedom.
+    const CHI2_95: f64 = 12.592;
+    let record = record();
+    let mut noise = rand_pcg::Pcg32::seed_from_u64(5);
+    let (mut answered, mut held, mut widest) = (0, 0, 0.0f64);
+    for seed in 0..24 {
+        let turn = noise.random_range(2.4..3.4);
+        let tilts = [noise.random_range(-0.5..0.5), noise.random_range(-0.5..0.5)];
+        let scene = Scene::new(UnitQuaternion::from_euler_angles(tilts[0], tilts[1], turn), seed);
+        let query = scene.query(&record, false);
+        let found = directional::recognise(&scene.views(), &query, &Config::default());
+        let Ok(found) = found else { continue };
+        let nees = found.pose.nees(&scene.truth).unwrap();
+        answered += 1;
+        held += usize::from(nees < CHI2_95);
+        let variance: f64 = found.pose.covariance.diagonal().rows(3, 3).sum();
+        widest = widest.max(variance.sqrt());
+    }
+    assert!(answered >= 22, "only {answered} of 24 answered");
+    assert!(held * 10 >= answered * 9, "the 95 % ellipsoid holds {held} of {answered}");
+    assert!(widest < 0.006, "a box 0.8 m away is stated to {:.1} mm only", 1e3 * widest);
+}
+
+#[test]
 fn a_picture_without_the_object_is_refused() {
     let record = record();
     let mut scene = Scene::new(UnitQuaternion::from_euler_angles(0.0, 0.0, 2.6), 7);

@@ -39,6 +39,10 @@ pub enum Method {
     Directional,
 }
 
+/// Most of a frame interval between the two pictures of a pair: half of it without a common trigger, and
+/// a little for uneven stamps.
+const PAIRED: f64 = 0.7;
+
 /// Settings of a find.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FindConfig {
@@ -392,8 +396,7 @@ impl Run<'_> {
     pub(crate) fn look(&mut self) -> Result<[Frame; 2], Stop> {
         let since = self.system.robot.clock.now();
         let joints = self.system.joints()?;
-        let left = self.system.frame_since(0, since)?;
-        let right = self.system.frame_since(1, since)?;
+        let [left, right] = self.system.pair_since(since, self.interval.mul_f64(PAIRED))?;
         self.observer.notice(&Event::Frame(Side::Left, &left, joints[0]));
         self.observer.notice(&Event::Frame(Side::Right, &right, joints[1]));
         Ok([left, right])

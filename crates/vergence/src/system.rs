@@ -135,6 +135,29 @@ impl System {
         }
     }
 
+    /// Pictures of both heads that were taken together, at most `apart` from each other, and not
+    /// before `since`. Cameras that are not triggered by one signal are half an interval apart at
+    /// the most; one that lost a picture is made up for by the next.
+    pub fn pair_since(
+        &mut self,
+        since: Duration,
+        apart: Duration,
+    ) -> Result<[Frame; 2], DeviceError> {
+        let mut pair = [self.frame_since(0, since)?, self.frame_since(1, since)?];
+        for _ in 0..STALE_FRAMES {
+            let [left, right] = [pair[0].stamp, pair[1].stamp];
+            if left.abs_diff(right) <= apart {
+                return Ok(pair);
+            }
+            let earlier = usize::from(right < left);
+            pair[earlier] = self.frame_since(earlier, since)?;
+        }
+        Err(DeviceError::Fault {
+            device: "cameras".into(),
+            fault: format!("no two pictures of theirs were taken within {apart:?} of each other"),
+        })
+    }
+
     /// The next picture of one head whose exposure began at or after `since`.
     pub fn frame_since(&mut self, side: usize, since: Duration) -> Result<Frame, DeviceError> {
         self.robot.heads[side].camera.skip_before(since);

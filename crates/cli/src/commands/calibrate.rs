@@ -11,7 +11,7 @@ use vergence_head::calibration::{Calibration, CalibrationConfig, middle};
 use vergence_head::{Noise, PanTiltHead};
 
 use crate::failure::Failure;
-use crate::light::{Person, SimulatedPerson};
+use crate::light::{Person, Ruler, SimulatedPerson};
 use crate::progress::Progress;
 use crate::robot::{BUILT, Opened, RobotArgs};
 
@@ -40,6 +40,13 @@ pub struct Calibrate {
     /// Standard deviation (m) of that length.
     #[arg(long, default_value_t = 0.0005)]
     length_sigma: f64,
+    /// Each place is measured in the base frame, to --place-sigma, and asked for on the terminal: then
+    /// the heads know where they stand in base.
+    #[arg(long)]
+    measured: bool,
+    /// Standard deviation (m) of each coordinate of a measured place.
+    #[arg(long, default_value_t = 0.001)]
+    place_sigma: f64,
     /// Seed of the simulated workcell.
     #[arg(long, default_value_t = 1)]
     seed: u64,
@@ -84,10 +91,13 @@ const SIGMAS_95: f64 = 1.96;
 /// Runs the command.
 pub fn run(args: &Calibrate) -> Result<bool, Failure> {
     let fits = |value: f64, high: f64| value > 0.0 && value < high;
-    if !fits(args.length, 10.0) || !fits(args.length_sigma, args.length) {
+    if !fits(args.length, 10.0)
+        || !fits(args.length_sigma, args.length)
+        || !fits(args.place_sigma, 1.0)
+    {
         return Err(Failure::misuse(
-            "--length and --length-sigma are not a length and its uncertainty",
-            "give both in metres, for example --length 0.5 --length-sigma 0.0005",
+            "--length, --length-sigma and --place-sigma are not a length and its uncertainties",
+            "give them in metres, for example --length 0.5 --length-sigma 0.0005",
         ));
     }
     let robot = RobotArgs { config: Some(args.config.clone()), seed: args.seed };
@@ -120,17 +130,19 @@ fn sightings(args: &Calibrate, opened: &mut Opened) -> Result<Session, Failure> 
         views: usize::from(args.views),
         find: FindConfig { seed: args.seed, ..FindConfig::default() },
     };
-    let places = usize::from(args.places).next_multiple_of(2);
-    let length = (args.length, args.length_sigma);
+    let ruler = Ruler {
+        places: usize::from(args.places).next_multiple_of(2),
+        length: (args.length, args.length_sigma),
+        measured: args.measured.then_some(args.place_sigma),
+    };
     let mut progress = Progress::steps();
     let collected = match opened.simulator() {
         Some(workcell) => {
-            let mut person =
-                SimulatedPerson::new(workcell, &args.object, places, length, args.seed);
+            let mut person = SimulatedPerson::new(workcell, &args.object, ruler, args.seed);
             vergence::collect(&mut opened.system, &args.object, &mut person, &config, &mut progress)
         }
         None => {
-            let mut person = Person::new(places, length);
+            let mut person = Person::new(ruler);
             // A person reads and answers: nothing may overwrite the prompt.
             vergence::collect(&mut opened.system, &args.object, &mut person, &config, &mut ())
         }

@@ -41,6 +41,8 @@ pub struct Series {
     pub freedom: f64,
     /// Courses of the surroundings that were taken out as well (unit length).
     pub local: Vec<Vec<f32>>,
+    /// Whether `noise` is known to hold here as well.
+    settled: bool,
 }
 
 impl Series {
@@ -48,7 +50,8 @@ impl Series {
     pub fn new(raw: &[f32], nuisance: &Nuisance, local: Vec<Vec<f32>>, noise: f64) -> Self {
         let taken = (nuisance.rank() + local.len()) as f64;
         let freedom = (raw.len() as f64 - taken).max(1.0);
-        let mut series = Series { values: Vec::new(), energy: 0.0, noise, freedom, local };
+        let mut series =
+            Series { values: Vec::new(), energy: 0.0, noise, freedom, local, settled: false };
         let mut values = raw.to_vec();
         series.clear(nuisance, &mut values);
         if clip(&mut values) {
@@ -81,13 +84,26 @@ impl Series {
         self.clear(nuisance, out);
     }
 
-    /// Energy with the prior's share added. A place that stays noisier than its neighbourhood once
-    /// the best light is taken out, by more than chance explains, has noise of its own.
+    /// Energy with the prior's share added.
     fn total(&self, explained: f64) -> f64 {
+        self.energy + NOISE_FRAMES * self.noise_beside(explained)
+    }
+
+    /// Variance of the noise of this place when so much of its energy is a light. A place that stays
+    /// noisier than its neighbourhood, by more than chance explains, has noise of its own.
+    fn noise_beside(&self, explained: f64) -> f64 {
+        if self.settled {
+            return self.noise;
+        }
         let own = (self.energy - explained).max(0.0) / self.freedom;
-        let chance = 1.0 + OWN_NOISE * (2.0 / self.freedom).sqrt();
-        let own = if own > chance * self.noise { own } else { self.noise };
-        self.energy + NOISE_FRAMES * own
+        self.noise.max(own / (1.0 + OWN_NOISE * (2.0 / self.freedom).sqrt()))
+    }
+
+    /// The same series with the noise that it has beside the light of `evidence`, whatever it is
+    /// compared with: two explanations are weighed with one and the same noise.
+    pub fn settled(&self, evidence: &Evidence) -> Series {
+        let noise = self.noise_beside(evidence.correlation * evidence.correlation);
+        Series { noise, settled: true, ..self.clone() }
     }
 }
 

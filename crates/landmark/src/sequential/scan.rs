@@ -17,10 +17,10 @@ use super::nuisance::{Nuisance, dot};
 pub const BLOCK: usize = 16;
 
 /// Places that go on from a scan for a family of patterns, and for each pattern beyond the first.
-const PER_FAMILY: (usize, usize) = (24, 4);
+const PER_FAMILY: (usize, usize) = (24, 1);
 
 /// Most places that go on for a family.
-const MOST_PER_FAMILY: usize = 96;
+const MOST_PER_FAMILY: usize = 64;
 
 /// Places that go on for their energy alone.
 pub const BY_ENERGY: usize = 48;

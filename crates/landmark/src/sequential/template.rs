@@ -156,7 +156,7 @@ fn phase_step(pattern: &Pattern, times: &[(f64, f64)], fine: bool) -> f64 {
     let frames = chip / between;
     if fine && (frames - frames.round()).abs() < 0.05 * frames {
         let exposure = times.first().map_or(0.0, |t| t.1);
-        return step.min((0.5 * exposure).max(chip / 16.0));
+        return step.min((0.25 * exposure).max(chip / 32.0));
     }
     step
 }

@@ -58,7 +58,7 @@ const FLOOR_PX: f64 = 0.02;
 
 /// Restless places to reckon with where the picture shows none but the one in question: so many in so
 /// many pixels.
-const UNSEEN: (f64, f64) = (0.005, 640.0 * 480.0);
+const UNSEEN: (f64, f64) = (0.002, 640.0 * 480.0);
 
 /// Foreign codes to reckon with in a picture, however many places are restless.
 const MOST_FOREIGN: f64 = 4.0;
@@ -429,6 +429,7 @@ impl Round<'_> {
         if self.is_another_code(request, seen) {
             return false;
         }
+        let series = &series.settled(&own);
         let mut scratch = Vec::new();
         let others = self.requests.len() - 1;
         for other in (0..self.requests.len()).filter(|o| *o != request) {
