@@ -7,7 +7,7 @@ use std::io;
 use std::net::TcpListener;
 use std::time::Duration;
 
-use vergence_air::{Air, AirConfig, Executor, serve, time};
+use vergence_air::{Air, AirConfig, Executor, serve};
 
 use crate::virtual_tag::{Plays, VirtualTag, spawn_tags};
 
@@ -27,7 +27,7 @@ impl TagServer {
         now: Duration,
         hearing: impl Fn(usize) -> Option<i8> + Send + 'static,
     ) -> io::Result<Self> {
-        let plays = Plays::new(tags.len()).ahead(now.saturating_sub(time::now()));
+        let plays = Plays::new(tags.len()).on_clock(now);
         let thread_plays = plays.clone();
         std::thread::Builder::new().name("tag server".into()).spawn(move || {
             let executor = Executor::new();

@@ -49,14 +49,27 @@ type Log = Arc<Mutex<Vec<LightPlay>>>;
 #[derive(Debug, Clone)]
 pub struct Plays {
     logs: Vec<Log>,
-    /// What the clock of the simulation is ahead of the radio's.
-    ahead: Duration,
+    clocks: Clocks,
+}
+
+/// One moment on two clocks, either of which may be ahead.
+#[derive(Debug, Clone, Copy, Default)]
+struct Clocks {
+    radio: Duration,
+    simulation: Duration,
+}
+
+impl Clocks {
+    /// A time of the radio's on the clock of the simulation.
+    fn simulation(self, radio: Duration) -> Duration {
+        (radio + self.simulation).saturating_sub(self.radio)
+    }
 }
 
 impl Plays {
     /// For this many tags, on the radio's own clock.
     pub(crate) fn new(tags: usize) -> Self {
-        Plays { logs: (0..tags).map(|_| Log::default()).collect(), ahead: Duration::ZERO }
+        Plays { logs: (0..tags).map(|_| Log::default()).collect(), clocks: Clocks::default() }
     }
 
     /// All plays of a tag (its index) that are not forgotten, in order of time.
@@ -72,9 +85,9 @@ impl Plays {
         }
     }
 
-    /// The same on a clock that is ahead of the radio's.
-    pub(crate) fn ahead(self, ahead: Duration) -> Self {
-        Plays { ahead, ..self }
+    /// The same on a clock that shows `simulation` now.
+    pub(crate) fn on_clock(self, simulation: Duration) -> Self {
+        Plays { clocks: Clocks { radio: time::now(), simulation }, ..self }
     }
 }
 
@@ -82,7 +95,7 @@ impl Plays {
 struct LoggedLights {
     count: u8,
     log: Log,
-    ahead: Duration,
+    clocks: Clocks,
 }
 
 impl Lights for LoggedLights {
@@ -94,7 +107,9 @@ impl Lights for LoggedLights {
 
     fn playing(&mut self, play: Option<&vergence_firmware::Play>) {
         let mut log = self.log.lock().unwrap_or_else(PoisonError::into_inner);
-        let at = |time: embassy_time::Instant| Duration::from_micros(time.as_micros()) + self.ahead;
+        let at = |time: embassy_time::Instant| {
+            self.clocks.simulation(Duration::from_micros(time.as_micros()))
+        };
         match play {
             Some(play) => log.push(LightPlay {
                 begin: at(play.begin),
@@ -103,7 +118,7 @@ impl Lights for LoggedLights {
             }),
             None => {
                 if let Some(last) = log.last_mut() {
-                    last.end = last.end.min(time::now() + self.ahead).max(last.begin);
+                    last.end = last.end.min(self.clocks.simulation(time::now())).max(last.begin);
                 }
             }
         }
@@ -134,7 +149,7 @@ pub(crate) fn spawn_tags(
     let start = |(tag, log): (VirtualTag, &Log)| {
         let controller = air.controller(tag.address.0);
         let id = controller.id();
-        let lights = LoggedLights { count: tag.lights, log: log.clone(), ahead: plays.ahead };
+        let lights = LoggedLights { count: tag.lights, log: log.clone(), clocks: plays.clocks };
         executor.spawn(run_tag(Hci::new(controller), tag, lights));
         id
     };
