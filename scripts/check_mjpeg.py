@@ -9,6 +9,7 @@ simple ones do (neither), and with a connection that breaks in the middle of a p
 when every picture arrives in order and with its brightness.
 """
 
+import collections
 import io
 import subprocess
 import sys
@@ -32,7 +33,8 @@ def picture(i):
 
 
 class Camera(BaseHTTPRequestHandler):
-    sent = 0
+    # Pictures sent in each manner: an earlier client's connection may outlive it by a picture or two.
+    sent = collections.Counter()
 
     def do_GET(self):
         manner = self.path.strip("/")
@@ -41,21 +43,21 @@ class Camera(BaseHTTPRequestHandler):
         self.end_headers()
         try:
             while True:
-                i = Camera.sent % PICTURES
+                i = Camera.sent[manner] % PICTURES
                 body = picture(i)
                 self.wfile.write(f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\n".encode())
                 if manner != "plain":
                     self.wfile.write(f"Content-Length: {len(body)}\r\n".encode())
-                    self.wfile.write(f"X-Timestamp: {5000 + Camera.sent * PERIOD:.6f}\r\n".encode())
-                if manner == "broken" and Camera.sent == 4:
-                    Camera.sent += 1
+                    self.wfile.write(f"X-Timestamp: {5000 + Camera.sent[manner] * PERIOD:.6f}\r\n".encode())
+                if manner == "broken" and Camera.sent[manner] == 4:
+                    Camera.sent[manner] += 1
                     self.wfile.write(b"\r\n" + body[: len(body) // 2])
                     self.wfile.flush()
                     return
                 self.wfile.write(b"\r\n" + body + b"\r\n")
-                Camera.sent += 1
+                Camera.sent[manner] += 1
                 # An uneven network: the time stamps are even, the arrivals are not.
-                time.sleep(PERIOD * (0.6 if Camera.sent % 2 else 1.4))
+                time.sleep(PERIOD * (0.6 if Camera.sent[manner] % 2 else 1.4))
         except (BrokenPipeError, ConnectionResetError):
             pass
 
@@ -64,7 +66,6 @@ class Camera(BaseHTTPRequestHandler):
 
 
 def probe(program, port, manner):
-    Camera.sent = 0
     url = f"http://127.0.0.1:{port}/{manner}"
     command = [program, url, str(SIZE[0]), str(SIZE[1]), str(PICTURES - 1)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
