@@ -18,12 +18,11 @@ use trouble_host::connection::Connection;
 use trouble_host::gatt::GattClient;
 use vergence_devices::{TagAddress, TagState};
 use vergence_firmware::Guard;
-use vergence_tag::cbor::{self, MAX_BYTES};
 use vergence_tag::gatt::{self, LONGEST_VALUE};
 use vergence_tag::{Command, State, Upload};
 
 use crate::central::{Host, LINKS};
-use crate::ears::Ears;
+use crate::ears::{Ears, checked};
 use crate::job::{Answer, Fault, Outcome, TagInfo, Task};
 use crate::pool::HeapPool;
 
@@ -111,20 +110,7 @@ impl<C: Controller> Conversation<'_, '_, '_, C> {
         if record.len() >= LONGEST_VALUE {
             record.extend(self.read(gatt::RECORD_REST).await?);
         }
-        if record.is_empty() {
-            return Err(Fault::Refused("holds no record".into()));
-        }
-        record.truncate(MAX_BYTES);
-        let claimed = self.ears.object_id(self.tag);
-        if let (Some(claimed), Ok(record)) = (claimed, cbor::decode(&record))
-            && !claimed.matches(&record.object_id)
-        {
-            return Err(Fault::Refused(format!(
-                "advertises \"{}\" but holds the record of \"{}\"",
-                claimed.name, record.object_id
-            )));
-        }
-        Ok(Answer::Record(record))
+        checked(record, self.ears.object_id(self.tag))
     }
 
     async fn info(&self) -> Outcome {

@@ -8,6 +8,9 @@ use trouble_host::prelude::EventHandler;
 use vergence_devices::{Advertisement, TagAddress};
 use vergence_tag::Beacon;
 use vergence_tag::beacon::short_id;
+use vergence_tag::cbor::{self, MAX_BYTES};
+
+use crate::job::{Answer, Fault, Outcome};
 
 #[derive(Default)]
 pub(crate) struct Ears {
@@ -42,6 +45,23 @@ impl Claim {
             None => object_id.starts_with(&self.name),
         }
     }
+}
+
+/// A record as it was read from a tag that made this claim.
+pub(crate) fn checked(mut record: Vec<u8>, claim: Option<Claim>) -> Outcome {
+    if record.is_empty() {
+        return Err(Fault::Refused("holds no record".into()));
+    }
+    record.truncate(MAX_BYTES);
+    if let (Some(claim), Ok(record)) = (claim, cbor::decode(&record))
+        && !claim.matches(&record.object_id)
+    {
+        return Err(Fault::Refused(format!(
+            "advertises \"{}\" but holds the record of \"{}\"",
+            claim.name, record.object_id
+        )));
+    }
+    Ok(Answer::Record(record))
 }
 
 impl Ears {

@@ -12,10 +12,11 @@ use vergence_devices::{
     Advertisement, Clock, DeviceError, LedCommand, TagAddress, TagLink, TagState,
 };
 use vergence_tag::Command;
-use vergence_tag::cbor::{self, MAX_BYTES};
 
 use crate::central::{self, LinkConfig};
-use crate::job::{Answer, Bond, Fault, Inbox, Job, Outcome, TagInfo, Task};
+use crate::job::{
+    Answer, Bond, Fault, Inbox, Job, Outcome, TagInfo, Task, led_command, name, wrong_answer,
+};
 
 /// HCI commands under way at once.
 const COMMANDS: usize = 10;
@@ -123,12 +124,7 @@ impl HciLink {
         record: &[u8],
         timeout: Duration,
     ) -> Result<(), DeviceError> {
-        let unfit = |what: String| DeviceError::Unsupported { device: name(tag), what };
-        if record.len() > MAX_BYTES {
-            return Err(unfit(format!("a record has {MAX_BYTES} bytes at most")));
-        }
-        cbor::decode(record).map_err(|error| unfit(error.to_string()))?;
-        self.attend(tag, Task::Write(record.to_vec()), timeout).map(drop)
+        self.attend(tag, Task::write(tag, record)?, timeout).map(drop)
     }
 
     /// Plays a pattern no longer than `limit`, whatever the tag's own longest time is.
@@ -234,24 +230,12 @@ impl TagLink for HciLink {
         command: LedCommand,
         timeout: Duration,
     ) -> Result<TagState, DeviceError> {
-        let command = match command {
-            LedCommand::Play(pattern) => Command::Play { pattern, limit: None },
-            LedCommand::Stop => Command::Stop,
-        };
-        self.led(tag, command, timeout)
+        self.led(tag, led_command(command), timeout)
     }
-}
-
-fn name(tag: TagAddress) -> String {
-    format!("tag {tag}")
 }
 
 fn dead() -> Fault {
     Fault::Dead("the radio thread ended".into())
-}
-
-fn wrong_answer(tag: TagAddress) -> DeviceError {
-    DeviceError::Fault { device: name(tag), fault: "another answer than was asked for".into() }
 }
 
 fn not_opened(target: &str, reason: io::Error) -> DeviceError {

@@ -9,7 +9,8 @@ use std::time::Duration;
 
 use trouble_host::att::AttErrorCode;
 use trouble_host::{BleHostError, Error};
-use vergence_devices::{Advertisement, DeviceError, TagAddress, TagState};
+use vergence_devices::{Advertisement, DeviceError, LedCommand, TagAddress, TagState};
+use vergence_tag::cbor::{self, MAX_BYTES};
 use vergence_tag::{Command, gatt};
 
 /// Work on one tag over a link.
@@ -27,6 +28,35 @@ pub(crate) enum Task {
     Pair(Option<u32>),
     /// End a link that is held for a light.
     Release,
+}
+
+impl Task {
+    /// Writes a record that is one; the tag checks it once more.
+    pub fn write(tag: TagAddress, record: &[u8]) -> Result<Self, DeviceError> {
+        let unfit = |what: String| DeviceError::Unsupported { device: name(tag), what };
+        if record.len() > MAX_BYTES {
+            return Err(unfit(format!("a record has {MAX_BYTES} bytes at most")));
+        }
+        cbor::decode(record).map_err(|error| unfit(error.to_string()))?;
+        Ok(Task::Write(record.to_vec()))
+    }
+}
+
+/// What a tag is told for a command of its light, which plays until the tag's own limit.
+pub(crate) fn led_command(command: LedCommand) -> Command {
+    match command {
+        LedCommand::Play(pattern) => Command::Play { pattern, limit: None },
+        LedCommand::Stop => Command::Stop,
+    }
+}
+
+/// A tag in errors.
+pub(crate) fn name(tag: TagAddress) -> String {
+    format!("tag {tag}")
+}
+
+pub(crate) fn wrong_answer(tag: TagAddress) -> DeviceError {
+    DeviceError::Fault { device: name(tag), fault: "another answer than was asked for".into() }
 }
 
 #[derive(Debug, Clone, PartialEq)]

@@ -6,12 +6,11 @@ use bluer::gatt::WriteOp;
 use bluer::gatt::remote::{Characteristic, CharacteristicWriteRequest};
 use bluer::{Device, Uuid};
 use vergence_devices::TagState;
-use vergence_tag::cbor::{self, MAX_BYTES};
 use vergence_tag::gatt::{self, LONGEST_VALUE};
 use vergence_tag::{State, Upload};
 
 use super::fault::fault;
-use crate::ears::Claim;
+use crate::ears::{Claim, checked};
 use crate::job::{Answer, Fault, Outcome, TagInfo, Task};
 
 /// A tag's characteristics by their UUIDs.
@@ -76,19 +75,7 @@ impl Server {
         if record.len() >= LONGEST_VALUE {
             record.extend(self.read(gatt::RECORD_REST).await?);
         }
-        if record.is_empty() {
-            return Err(Fault::Refused("holds no record".into()));
-        }
-        record.truncate(MAX_BYTES);
-        if let (Some(claim), Ok(record)) = (claim, cbor::decode(&record))
-            && !claim.matches(&record.object_id)
-        {
-            return Err(Fault::Refused(format!(
-                "advertises \"{}\" but holds the record of \"{}\"",
-                claim.name, record.object_id
-            )));
-        }
-        Ok(Answer::Record(record))
+        checked(record, claim)
     }
 
     async fn info(&self, device: &Device) -> Outcome {

@@ -24,11 +24,10 @@ use futures::StreamExt;
 use tokio::runtime::Runtime;
 use tokio::time::{Instant, sleep, timeout, timeout_at};
 use vergence_devices::{Advertisement, DeviceError, LedCommand, TagAddress, TagLink, TagState};
-use vergence_tag::cbor::{self, MAX_BYTES};
 use vergence_tag::{Command, Pattern};
 
 use crate::ears::Ears;
-use crate::job::{Answer, Bond, Fault, Outcome, TagInfo, Task};
+use crate::job::{Answer, Bond, Fault, Outcome, TagInfo, Task, led_command, name, wrong_answer};
 use crate::radio::TagRadio;
 use agent::Passkeys;
 use closing::Closing;
@@ -107,12 +106,7 @@ impl TagRadio for BluezLink {
         record: &[u8],
         timeout: Duration,
     ) -> Result<(), DeviceError> {
-        let unfit = |what: String| DeviceError::Unsupported { device: name(tag), what };
-        if record.len() > MAX_BYTES {
-            return Err(unfit(format!("a record has {MAX_BYTES} bytes at most")));
-        }
-        cbor::decode(record).map_err(|error| unfit(error.to_string()))?;
-        self.attend(tag, &Task::Write(record.to_vec()), timeout).map(drop)
+        self.attend(tag, &Task::write(tag, record)?, timeout).map(drop)
     }
 
     fn play_for(
@@ -172,11 +166,7 @@ impl TagLink for BluezLink {
         command: LedCommand,
         timeout: Duration,
     ) -> Result<TagState, DeviceError> {
-        let command = match command {
-            LedCommand::Play(pattern) => Command::Play { pattern, limit: None },
-            LedCommand::Stop => Command::Stop,
-        };
-        self.led(tag, command, timeout)
+        self.led(tag, led_command(command), timeout)
     }
 }
 
@@ -332,12 +322,4 @@ impl Radio {
 
 fn event_is_of(event: &AdapterEvent, tag: TagAddress) -> bool {
     matches!(event, AdapterEvent::DeviceAdded(address) if address.0 == tag.0)
-}
-
-fn name(tag: TagAddress) -> String {
-    format!("tag {tag}")
-}
-
-fn wrong_answer(tag: TagAddress) -> DeviceError {
-    DeviceError::Fault { device: name(tag), fault: "another answer than was asked for".into() }
 }
