@@ -84,7 +84,7 @@ impl Default for Config {
             finalists: 6,
             grazing: 0.1,
             distinct: 2f64.to_radians(),
-            different: 6f64.to_radians(),
+            different: 12f64.to_radians(),
             least_coverage: 0.5,
             least_confidence: 0.9,
             most_turn: 15f64.to_radians(),
@@ -259,7 +259,7 @@ impl Search<'_> {
     fn weigh(&self, mut refined: Refined, pass: &Pass) -> (Refined, Explained) {
         self.lay_out(&mut refined, pass);
         let mut explained = verdict::weigh(&refined.sites, pass.layout.range_px, pass.sd_px);
-        explained.evidence -= refined.strain;
+        explained.evidence = explained.evidence - refined.strain;
         (refined, explained)
     }
 

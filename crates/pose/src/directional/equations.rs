@@ -41,7 +41,7 @@ const SCATTER_SHARE: f64 = 0.3;
 /// Independent sites that the expected scatter of a part's edges counts for.
 const SCATTER_PRIOR: f64 = 1.5;
 /// Degrees of freedom of the parts' offsets.
-const OFFSET_TAIL: f64 = 2.0;
+pub(super) const OFFSET_TAIL: f64 = 2.0;
 
 /// Changes of the unknowns.
 #[derive(Clone)]

@@ -1,11 +1,11 @@
 //! Optima beside the best pose.
 //!
-//! **In:** the best refined pose. **Out:** the best of its neighbourhood, with a covariance that
-//! holds the others. Print, lips and shadows run parallel to the contour a pixel or two away, and a
+//! **In:** the best refined pose. **Out:** the mean of its neighbourhood, with a covariance that holds
+//! all of it. Print, lips and shadows run parallel to the contour a pixel or two away, and a
 //! refinement stops at the first place that fits: the likelihood has several tops. The refinement is
 //! started again from where the contour lies a few pixels off, in every direction in which a pose can
-//! move it. The distinct tops are components of a mixture with their odds as weights; its second
-//! moment about the best is the covariance. So a pose whose edges are certain gets a small one, and a
+//! move it. The distinct tops are components of a mixture: its mean is the estimate, its second moment
+//! about that, with the odds taken less seriously, the covariance. So a pose whose edges are certain gets a small one, and a
 //! pose that might sit on the wrong line of print says so.
 
 use nalgebra::{Matrix6, Vector6};
@@ -22,14 +22,14 @@ const HOP_PX: f64 = 2.5;
 const CAUGHT_PX: f64 = 0.4;
 /// Optima whose contours are nearer than this (px) are one.
 const SAME_PX: f64 = 0.2;
-/// Optima with lower odds do not count.
-const LEAST_ODDS: f64 = 0.01;
 /// A direction is left out when it takes more than this (rad or m) to move the contour that far: a
 /// turn about the axis of a solid of revolution.
 const BLIND: f64 = 0.2;
-/// Nats to one that count: edges along a contour are not independent of each other, so evidence
-/// comes cheaper than it is.
-pub const NATS_TO_ONE: f64 = 6.0;
+/// Nats of evidence to one of doubt, by which the covariance weighs optima: a line of print runs along
+/// a whole part, so all its sites agree in the wrong place together.
+const DOUBT_NATS: f64 = 6.0;
+/// Optima further behind than this (nats of doubt) do not count.
+const MOST_BEHIND: f64 = 4.6;
 
 impl Search<'_> {
     /// Moves to the best optimum nearby and widens the covariance by the others.
@@ -78,21 +78,29 @@ fn contour_metric(refined: &Refined) -> Matrix6<f64> {
 }
 
 impl Search<'_> {
-    /// The best of some optima with the second moment of all about it.
+    /// The mean of some optima by belief, with the second moment about it of all by doubt.
     fn mixture(&self, mut optima: Vec<(Refined, Explained)>) -> (Refined, Explained) {
         optima.sort_by(|a, b| b.1.evidence.total_cmp(&a.1.evidence));
-        let best = optima[0].1;
-        let odds = |e: &Explained| ((e.evidence - best.evidence) / NATS_TO_ONE).exp();
-        optima.retain(|o| odds(&o.1) > LEAST_ODDS);
-        let (mut covariance, mut total) = (Matrix6::zeros(), 0.0);
+        let explained = optima[0].1;
+        let behind = |e: &Explained| explained.evidence - e.evidence;
+        optima.retain(|o| behind(&o.1) < MOST_BEHIND * DOUBT_NATS);
         let place = optima[0].0.pose;
+        let (mut mean, mut beliefs) = (Vector6::zeros(), 0.0);
         for (refined, explained) in &mut optima {
             self.doubt(refined, &FINAL);
-            let d = difference(&place, &refined.pose);
-            covariance += (refined.covariance + d * d.transpose()) * odds(explained);
-            total += odds(explained);
+            let belief = (-behind(explained)).exp();
+            mean += difference(&place, &refined.pose) * belief;
+            beliefs += belief;
+        }
+        let pose = perturb(&place, &(mean / beliefs));
+        let (mut covariance, mut odds) = (Matrix6::zeros(), 0.0);
+        for (refined, explained) in &optima {
+            let doubt = (-behind(explained) / DOUBT_NATS).exp();
+            let d = difference(&pose, &refined.pose);
+            covariance += (refined.covariance + d * d.transpose()) * doubt;
+            odds += doubt;
         }
         let top = optima.swap_remove(0).0;
-        (Refined { covariance: covariance / total, ..top }, best)
+        (Refined { pose, covariance: covariance / odds, ..top }, explained)
     }
 }

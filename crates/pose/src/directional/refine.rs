@@ -65,7 +65,7 @@ pub fn deviation(site: &Site, sd_px: f64) -> f64 {
 
 /// What holds against an attitude in which nothing can rest, where gravity is known (nats): objects
 /// in a room stand or lie unless a hand holds them.
-const UNSUPPORTED: f64 = 40.0;
+const UNSUPPORTED: f64 = 20.0;
 
 /// How many independent measurements a site is worth.
 pub fn independent(site: &Site) -> f64 {
