@@ -159,3 +159,19 @@ fn misuse_is_two() {
     assert_eq!(vergence(&["find"]).status.code(), Some(2));
     assert_eq!(vergence(&["experiment", "9"]).status.code(), Some(2));
 }
+
+#[test]
+fn poses_of_simulated_scenes_are_right_and_honest() {
+    let output = vergence(&["evaluate", "pose", "--scenes", "24", "--seed", "1000", "--json"]);
+    assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+    let figures = json(&output);
+    let number = |name: &str| figures[name].as_f64().unwrap();
+    assert!(number("answered") >= 20.0, "{figures}");
+    assert!(number("within_5mm_5deg") >= 0.75, "{figures}");
+    assert!(number("ellipsoid_95_coverage") >= 0.75, "{figures}");
+    assert!(figures["wrong_seeds"].as_array().unwrap().len() <= 2, "{figures}");
+
+    let none = vergence(&["evaluate", "pose", "--scenes", "0"]);
+    assert_eq!(none.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&none.stderr).contains("--scenes 0"));
+}

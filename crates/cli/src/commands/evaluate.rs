@@ -1,5 +1,8 @@
 //! `vergence evaluate head`: how accurate and how fast the head is, in simulation; `vergence evaluate
-//! equation`: equation (1) of the paper over the workspace.
+//! equation`: equation (1) of the paper over the workspace; `vergence evaluate pose`: the pose
+//! recogniser on simulated stereo pairs.
+
+mod pose;
 
 use clap::{Args as ClapArgs, Subcommand, ValueEnum};
 use serde_json::json;
@@ -21,6 +24,8 @@ pub struct Evaluate {
 enum What {
     /// Distance error before and after self-calibration, its predicted error, and time to fixation.
     Head(Head),
+    /// Accuracy, honesty and time of the pose recogniser.
+    Pose(pose::Pose),
     /// Error of the paper's equation (1) over the workspace, free of noise.
     Equation {
         /// Print one JSON document.
@@ -66,6 +71,7 @@ enum Light {
 pub fn run(args: Evaluate) -> Result<bool, Failure> {
     match args.what {
         What::Head(args) => run_head(&args),
+        What::Pose(args) => pose::run(&args),
         What::Equation { json } => {
             run_equation(json);
             Ok(true)

@@ -34,11 +34,23 @@ pub struct PoseArgs {
 
 /// How to recognise.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum Method {
+pub enum Method {
     /// The 2005 paper's: Canny, box template, distance transform, correlation.
     Paper,
     /// Directional distance fields, a search over all rotations, refinement, a verdict.
     Directional,
+}
+
+impl Method {
+    /// Recognises with the method's default settings.
+    pub fn recognise(self, views: &[View], query: &Query) -> Result<ObjectPose, Refusal> {
+        match self {
+            Method::Paper => paper::recognise(views, query, &paper::Config::default()),
+            Method::Directional => {
+                directional::recognise(views, query, &directional::Config::default())
+            }
+        }
+    }
 }
 
 /// What came of one scene.
@@ -76,12 +88,7 @@ fn recognise(id: u32, folder: &Path, args: &PoseArgs) -> Result<Outcome, Failure
     let scene = Scene::read(folder)?;
     let (views, query) = (scene.views(), scene.query());
     let start = Instant::now();
-    let result = match args.method {
-        Method::Paper => paper::recognise(&views, &query, &paper::Config::default()),
-        Method::Directional => {
-            directional::recognise(&views, &query, &directional::Config::default())
-        }
-    };
+    let result = args.method.recognise(&views, &query);
     let seconds = start.elapsed().as_secs_f64();
     if let Some(folder) = &args.save {
         save_pictures(folder, id, &views, &query, args.method)?;

@@ -1,0 +1,233 @@
+//! `vergence evaluate pose`: how right, how honest and how fast the pose recogniser is on stereo
+//! pairs that the simulator draws, one a seed.
+//!
+//! Nobody tells the recogniser whether the object stands; gravity is known. Every figure but those
+//! of honesty counts a refusal as wrong.
+
+use std::collections::BTreeMap;
+use std::time::Instant;
+
+use clap::Args;
+use nalgebra::Vector3;
+use serde_json::json;
+use vergence_geometry::Symmetry;
+use vergence_pose::{ObjectPose, Query, Refusal, View};
+use vergence_sim::{Scenario, StereoScene, stereo_scene};
+
+use crate::commands::pose::Method;
+use crate::failure::Failure;
+
+/// Recognise objects in simulated stereo pairs and compare with the truth.
+#[derive(Args)]
+pub struct Pose {
+    /// Scenes to draw.
+    #[arg(long, default_value_t = 300)]
+    scenes: u64,
+    /// Seed of the first scene; the others follow.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// How to recognise.
+    #[arg(long, value_enum, default_value_t = Method::Directional)]
+    method: Method,
+    /// Scenes worked on at the same time; the times are right only with one.
+    #[arg(long, default_value_t = 1)]
+    threads: usize,
+    /// Print one JSON document.
+    #[arg(long)]
+    json: bool,
+}
+
+/// What came of one scene.
+enum Outcome {
+    Answer(Answer),
+    /// Why there is none, without the numbers.
+    Refused(&'static str),
+}
+
+/// An answer against the truth.
+struct Answer {
+    seed: u64,
+    position_mm: f64,
+    rotation_deg: f64,
+    /// Normalised squared error over its degrees of freedom; whether the 95 % ellipsoid holds the
+    /// truth.
+    nees: Option<(f64, bool)>,
+}
+
+/// Runs the command.
+pub fn run(args: &Pose) -> Result<bool, Failure> {
+    if args.scenes == 0 || args.scenes > 100_000 {
+        let what = format!("--scenes {} is not between 1 and 100000", args.scenes);
+        return Err(Failure::misuse(what, "give a number in that range"));
+    }
+    let pool = rayon::ThreadPoolBuilder::new()
+        .num_threads(args.threads.max(1))
+        .build()
+        .map_err(|e| Failure::failed(e, "ask for fewer --threads"))?;
+    let seeds = args.seed..args.seed.saturating_add(args.scenes);
+    let outcomes: Result<Vec<(Outcome, f64)>, Failure> = pool.install(|| {
+        use rayon::prelude::*;
+        seeds.into_par_iter().map(|seed| recognise(seed, args.method)).collect()
+    });
+    let figures = Figures::of(&outcomes?);
+    if args.json {
+        println!("{}", figures.document(args));
+    } else {
+        figures.print(args);
+    }
+    Ok(figures.answered > 0)
+}
+
+/// One scene, with the seconds that its recognition took.
+fn recognise(seed: u64, method: Method) -> Result<(Outcome, f64), Failure> {
+    let scene = stereo_scene(Scenario::Default, seed)
+        .map_err(|e| Failure::failed(e, "take another --seed"))?;
+    let views = [0, 1].map(|k| View {
+        image: &scene.images[k],
+        camera: scene.cameras[k],
+        base_from_optical: scene.base_from_optical[k],
+        turn_sd: 0.0,
+    });
+    let query = Query {
+        record: &scene.record,
+        landmark: scene.landmark,
+        landmark_index: 0,
+        up: Some(Vector3::z_axis()),
+        standing: None,
+    };
+    let start = Instant::now();
+    let result = method.recognise(&views, &query);
+    let seconds = start.elapsed().as_secs_f64();
+    let outcome = match result {
+        Ok(found) => Outcome::Answer(Answer::new(seed, &found, &scene)),
+        Err(refusal) => Outcome::Refused(match refusal {
+            Refusal::Ambiguous { .. } => "another pose explains the edges about as well",
+            Refusal::TooFewEdges { .. } => "too little of the contour lies on edges",
+            _ => "the scene could not be worked on",
+        }),
+    };
+    Ok((outcome, seconds))
+}
+
+impl Answer {
+    fn new(seed: u64, found: &ObjectPose, scene: &StereoScene) -> Self {
+        let (pose, truth) = (&found.pose.pose, &scene.base_from_object);
+        // 95 % quantiles of chi-squared with six, five and three degrees of freedom.
+        let limit = match found.symmetry {
+            Symmetry::Finite(_) => 12.592,
+            Symmetry::Revolution { .. } => 11.070,
+            Symmetry::Full => 7.815,
+        };
+        Answer {
+            seed,
+            position_mm: 1e3 * (pose.translation.vector - truth.translation.vector).norm(),
+            rotation_deg: found
+                .symmetry
+                .angle_between(&pose.rotation, &truth.rotation)
+                .to_degrees(),
+            nees: found
+                .nees(truth)
+                .map(|(squares, freedoms)| (squares / freedoms as f64, squares < limit)),
+        }
+    }
+
+    fn within(&self, mm: f64, deg: f64) -> bool {
+        self.position_mm <= mm && self.rotation_deg <= deg
+    }
+}
+
+/// What the command prints.
+struct Figures {
+    scenes: usize,
+    answered: usize,
+    within_5: f64,
+    within_2: f64,
+    median_mm: f64,
+    median_deg: f64,
+    /// Seeds of answers off by more than 10 mm or 5 degrees.
+    wrong: Vec<u64>,
+    /// Share of the answers whose ellipsoid holds the truth.
+    held: f64,
+    /// Median over the answers of the squared error over its degrees of freedom.
+    nees: f64,
+    refused: BTreeMap<&'static str, usize>,
+    median_ms: f64,
+}
+
+impl Figures {
+    fn of(outcomes: &[(Outcome, f64)]) -> Self {
+        let (mut answers, mut refused) = (Vec::new(), BTreeMap::new());
+        for (outcome, _) in outcomes {
+            match outcome {
+                Outcome::Answer(answer) => answers.push(answer),
+                Outcome::Refused(why) => *refused.entry(*why).or_default() += 1,
+            }
+        }
+        let share = |of: &dyn Fn(&Answer) -> bool, all: usize| {
+            answers.iter().filter(|a| of(a)).count() as f64 / all.max(1) as f64
+        };
+        let of_all = |value: fn(&Answer) -> f64| {
+            let missing = std::iter::repeat_n(f64::INFINITY, outcomes.len() - answers.len());
+            median(answers.iter().map(|a| value(a)).chain(missing))
+        };
+        Figures {
+            scenes: outcomes.len(),
+            answered: answers.len(),
+            within_5: share(&|a| a.within(5.0, 5.0), outcomes.len()),
+            within_2: share(&|a| a.within(2.0, 2.0), outcomes.len()),
+            median_mm: of_all(|a| a.position_mm),
+            median_deg: of_all(|a| a.rotation_deg),
+            wrong: answers.iter().filter(|a| !a.within(10.0, 5.0)).map(|a| a.seed).collect(),
+            held: share(&|a| a.nees.is_some_and(|(_, held)| held), answers.len()),
+            nees: median(answers.iter().filter_map(|a| a.nees).map(|(n, _)| n)),
+            refused,
+            median_ms: 1e3 * median(outcomes.iter().map(|o| o.1)),
+        }
+    }
+
+    fn document(&self, args: &Pose) -> serde_json::Value {
+        json!({
+            "scenes": self.scenes,
+            "seed": args.seed,
+            "answered": self.answered,
+            "within_5mm_5deg": self.within_5,
+            "within_2mm_2deg": self.within_2,
+            "median_position_mm": self.median_mm,
+            "median_rotation_deg": self.median_deg,
+            "wrong_seeds": self.wrong,
+            "ellipsoid_95_coverage": self.held,
+            "nees_over_freedoms_median": self.nees,
+            "refused": self.refused,
+            "median_ms": self.median_ms,
+        })
+    }
+
+    fn print(&self, args: &Pose) {
+        println!("{} simulated stereo scenes from seed {}", self.scenes, args.seed);
+        println!("answered                          {}", self.answered);
+        println!("within 5 mm, 5 deg (of all)       {:.3}", self.within_5);
+        println!("within 2 mm, 2 deg (of all)       {:.3}", self.within_2);
+        println!(
+            "median error (of all)             {:.2} mm, {:.2} deg",
+            self.median_mm, self.median_deg
+        );
+        println!(
+            "answers beyond 10 mm or 5 deg     {} {}",
+            self.wrong.len(),
+            if self.wrong.is_empty() { String::new() } else { format!("(seeds {:?})", self.wrong) }
+        );
+        println!("95 % ellipsoid holds the truth    {:.3} of the answers", self.held);
+        println!("squared error over its freedoms   {:.2} median", self.nees);
+        for (why, count) in &self.refused {
+            println!("refused: {why}: {count}");
+        }
+        println!("time                              {:.1} ms median", self.median_ms);
+    }
+}
+
+/// The upper median; not a number when there is none.
+fn median(values: impl Iterator<Item = f64>) -> f64 {
+    let mut values: Vec<f64> = values.collect();
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied().unwrap_or(f64::NAN)
+}
