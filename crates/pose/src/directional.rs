@@ -32,7 +32,7 @@ use verdict::Explained;
 /// Roughly refined poses that get their chance however far behind (nats) they are, and how far behind
 /// others may be: the rough contour of a tilted or hidden object may explain little.
 const SURE_FINALISTS: usize = 4;
-const BEHIND: f64 = 30.0;
+const BEHIND: f64 = 15.0;
 
 /// Alternatives reported.
 const MOST_ALTERNATIVES: usize = 4;
@@ -53,7 +53,12 @@ pub struct Config {
     pub seeds: usize,
     /// Halvings of the step while improving, from half the grid's spacing.
     pub climb_halvings: usize,
-    /// Hypotheses refined on the pictures at the working scale.
+    /// Shares of the best one's evidence that a hypothesis must have to be improved on the fields,
+    /// and then to be refined: what is far behind there has never won.
+    pub worth_a_climb: f32,
+    /// See `worth_a_climb`.
+    pub worth: f32,
+    /// Hypotheses refined on the pictures at the working scale, at most.
     pub refined: usize,
     /// Of those, how many are refined at full resolution at most.
     pub finalists: usize,
@@ -80,6 +85,8 @@ impl Default for Config {
             shortlist: 400,
             seeds: 32,
             climb_halvings: 3,
+            worth_a_climb: 0.4,
+            worth: 0.6,
             refined: 16,
             finalists: 6,
             grazing: 0.1,
@@ -248,8 +255,12 @@ impl Search<'_> {
     fn both(&self, refined: Refined) -> (Refined, Explained) {
         // Print is fine, outlines are coarse: both scales have their say in what is explained.
         let s = self.scale();
+        let fine = Pass::new(0.4, 4.0, 2.0, true);
+        if s == 1.0 {
+            return self.weigh(refined, &fine);
+        }
         let (refined, coarse) = self.weigh(refined, &Pass::new(0.5 * s, 4.0 * s, 2.0 * s, false));
-        let (refined, mut fine) = self.weigh(refined, &Pass::new(0.4, 4.0, 2.0, true));
+        let (refined, mut fine) = self.weigh(refined, &fine);
         fine.evidence = 0.5 * (fine.evidence + coarse.evidence);
         fine.coverage = fine.coverage.min(coarse.coverage);
         (refined, fine)
@@ -259,7 +270,7 @@ impl Search<'_> {
     fn weigh(&self, mut refined: Refined, pass: &Pass) -> (Refined, Explained) {
         self.lay_out(&mut refined, pass);
         let mut explained = verdict::weigh(&refined.sites, pass.layout.range_px, pass.sd_px);
-        explained.evidence = explained.evidence - refined.strain;
+        explained.evidence -= refined.strain;
         (refined, explained)
     }
 

@@ -77,6 +77,10 @@ pub(crate) struct Line {
 }
 
 impl Outline {
+    fn with_capacity(count: usize) -> Self {
+        Outline { points: Vec::with_capacity(count), lines: Vec::with_capacity(count) }
+    }
+
     fn clear(&mut self) {
         self.points.clear();
         self.lines.clear();
@@ -132,7 +136,7 @@ impl Model {
     /// `fine` asks for enough chords that a rim is true to a thousandth of its radius, else a coarse
     /// polygon is given, good for ranking.
     pub fn contour(&self, eye: &Vector3<f64>, fine: bool, out: &mut Contour) {
-        let mut outline = Outline::default();
+        let mut outline = Outline::with_capacity(2 * FINE_CHORDS);
         self.outline(eye, fine, &mut outline);
         let at = |k: u16| outline.points[usize::from(k)];
         out.clear();

@@ -1,6 +1,7 @@
 //! What the recognisers are given and what they give back.
 
-use nalgebra::{Matrix3, Point3, Unit, UnitQuaternion, Vector3};
+use nalgebra::{DMatrix, Matrix3, Point3, Unit, UnitQuaternion, Vector3};
+use vergence_geometry::gaussian::difference;
 use vergence_geometry::{Camera, GaussianPoint, GaussianPose, Symmetry, Transform};
 use vergence_imaging::Image;
 use vergence_tag::{Record, Shape};
@@ -130,6 +131,33 @@ pub struct ObjectPose {
     pub symmetry: Symmetry,
 }
 
+impl ObjectPose {
+    /// Normalised estimation error squared of `truth` (`base_from_object`) over what the result
+    /// speaks about, with its degrees of freedom: six, without the turn about its axis five for a
+    /// solid of revolution, three for a ball. `None` when the covariance is singular.
+    pub fn nees(&self, truth: &Transform) -> Option<(f64, usize)> {
+        let pose = &self.pose.pose;
+        let error = difference(pose, &self.symmetry.nearest(truth, pose));
+        let axis = pose.rotation * Vector3::z_axis();
+        // Directions of the turns that count.
+        let across = axis.cross(&pose.transform_vector(&Vector3::x()));
+        let turns = match self.symmetry {
+            Symmetry::Finite(_) => vec![Vector3::x(), Vector3::y(), Vector3::z()],
+            Symmetry::Revolution { .. } => vec![across, axis.cross(&across)],
+            Symmetry::Full => Vec::new(),
+        };
+        let freedoms = turns.len() + 3;
+        let mut by = DMatrix::zeros(freedoms, 6);
+        for (row, turn) in turns.iter().enumerate() {
+            by.fixed_view_mut::<1, 3>(row, 0).copy_from(&turn.transpose());
+        }
+        by.fixed_view_mut::<3, 3>(freedoms - 3, 3).fill_diagonal(1.0);
+        let error = &by * error;
+        let factor = (&by * self.pose.covariance * by.transpose()).cholesky()?;
+        Some((error.dot(&factor.solve(&error)), freedoms))
+    }
+}
+
 /// Why there is no pose.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Refusal {
@@ -225,4 +253,55 @@ pub(crate) fn check(
         return Err(Refusal::OutOfView);
     }
     Ok(site)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::{Matrix6, UnitQuaternion, Vector6};
+    use vergence_geometry::gaussian::perturb;
+
+    fn found(symmetry: Symmetry) -> ObjectPose {
+        let pose = Transform::from_parts(
+            Vector3::new(0.5, 0.1, 0.2).into(),
+            UnitQuaternion::from_euler_angles(0.4, -0.3, 1.0),
+        );
+        let covariance = Matrix6::identity() * 1e-4;
+        let pose = GaussianPose { pose, covariance };
+        ObjectPose { pose, confidence: 1.0, coverage: 1.0, alternatives: Vec::new(), symmetry }
+    }
+
+    #[test]
+    fn what_cannot_be_seen_does_not_count_as_an_error() {
+        let shift = Vector6::new(0.0, 0.0, 0.0, 0.01, 0.0, 0.0);
+        for (symmetry, freedoms, turn) in [
+            (
+                Symmetry::Revolution { flip: false },
+                5,
+                UnitQuaternion::from_euler_angles(0.0, 0.0, 2.0),
+            ),
+            (
+                Symmetry::of_box([0.1, 0.2, 0.3], 1e-4),
+                6,
+                UnitQuaternion::from_euler_angles(0.0, std::f64::consts::PI, 0.0),
+            ),
+            (Symmetry::Full, 3, UnitQuaternion::from_euler_angles(1.0, 0.5, 2.0)),
+        ] {
+            let found = found(symmetry);
+            let mut truth = perturb(&found.pose.pose, &shift);
+            truth.rotation *= turn;
+            let (squares, of) = found.nees(&truth).unwrap();
+            assert_eq!(of, freedoms);
+            assert!((squares - 1.0).abs() < 1e-6, "{squares}");
+        }
+    }
+
+    #[test]
+    fn a_tilt_counts() {
+        let found = found(Symmetry::Revolution { flip: false });
+        let across = found.pose.pose.rotation * Vector3::x() * 0.02;
+        let tilt = Vector6::new(across.x, across.y, across.z, 0.0, 0.0, 0.0);
+        let (squares, _) = found.nees(&perturb(&found.pose.pose, &tilt)).unwrap();
+        assert!((squares - 4.0).abs() < 1e-2, "{squares}");
+    }
 }

@@ -15,6 +15,7 @@
 //! and noise make some edges far worse than others), and the offset of a part (heavy tails, as of a
 //! Student's t: a part that is seen to be far off may well be).
 
+use multiversion::multiversion;
 use nalgebra::{Matrix4, Matrix6, RowVector4, SMatrix, SVector, Vector2, Vector4};
 
 use super::sites::Site;
@@ -28,6 +29,7 @@ pub(super) const VIEWS: usize = 2;
 /// All unknowns, and those of one part: its offset and tilt (m), its offset in each view (px).
 const ALL: usize = SHARED + OWN * VIEWS;
 const PART: usize = 2 + VIEWS;
+const WITH_PART: usize = ALL + PART;
 
 /// Length of a piece (m), and the deviation of its offset from its part's (m): dents, print.
 const PIECE: f64 = 0.015;
@@ -117,19 +119,20 @@ impl Equations {
     /// Turns the sites into equations, without what only the parts' own offsets explain; to be
     /// called once all sites are in. `offsets` are the parts' offsets as last seen.
     pub fn share_errors(&mut self, offsets: &[(u32, f64)]) {
-        let mut edges = std::mem::take(&mut self.edges);
-        edges.sort_by_key(|e| e.key);
-        for part in edges.chunk_by(|a, b| a.key.0 == b.key.0) {
+        let edges = std::mem::take(&mut self.edges);
+        let mut sorted: Vec<&Edge> = edges.iter().collect();
+        sorted.sort_by_key(|e| e.key);
+        for part in sorted.chunk_by(|a, b| a.key.0 == b.key.0) {
             let known = offsets.iter().find(|o| o.0 == part[0].key.0);
             self.part(part, known.map_or(0.0, |o| o.1));
         }
     }
 
-    fn part(&mut self, edges: &[Edge], offset: f64) {
+    fn part(&mut self, edges: &[&Edge], offset: f64) {
         let scatter: [f64; VIEWS] = std::array::from_fn(|v| self.scatter(edges, v));
         let (first, last) = (edges[0].key.1, edges[edges.len() - 1].key.1);
-        let mut a = SMatrix::<f64, { ALL + PART }, { ALL + PART }>::zeros();
-        let mut b = SVector::<f64, { ALL + PART }>::zeros();
+        let mut a = SMatrix::<f64, WITH_PART, WITH_PART>::zeros();
+        let mut b = SVector::<f64, WITH_PART>::zeros();
         let mut of_site = b;
         let mut of_piece = b;
         for piece in edges.chunk_by(|a, b| a.key.1 == b.key.1) {
@@ -155,14 +158,14 @@ impl Equations {
                 of_site[ALL + 1] = scale * place;
                 of_site[ALL + 2 + v] = 1.0;
                 let weight = weight / scatter[v];
-                a.ger(weight, &of_site, &of_site, 1.0);
+                add_outer(&mut a, weight, &of_site);
                 b.axpy(weight * residual, &of_site, 1.0);
                 of_piece.axpy(weight * scale, &of_site, 1.0);
                 information += weight * scale * scale;
                 moment += weight * scale * residual;
             }
             let share = 1.0 / (information + (self.doubt * PIECE_SD).powi(-2));
-            a.ger(-share, &of_piece, &of_piece, 1.0);
+            add_outer(&mut a, -share, &of_piece);
             b.axpy(-share * moment, &of_piece, 1.0);
         }
         // Heavy tails: a part that was seen to be off by much may well be off by much.
@@ -186,7 +189,7 @@ impl Equations {
     }
 
     /// Variance of a part's edges in a view about their mean (px^2).
-    fn scatter(&self, edges: &[Edge], view: usize) -> f64 {
+    fn scatter(&self, edges: &[&Edge], view: usize) -> f64 {
         let edges = || edges.iter().filter(|e| e.key.2 == view);
         let weight: f64 = edges().map(|e| e.weight).sum();
         if weight <= 0.0 {
@@ -256,6 +259,19 @@ impl Equations {
         let offset = |p: &Eliminated| (p.inverse * (p.rhs - p.mixed.tr_mul(&x)))[0];
         let offsets = self.parts.iter().map(|p| (p.part, offset(p))).collect();
         Some(Solution { step, covariance, offsets })
+    }
+}
+
+/// Adds `weight v v'`.
+#[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
+fn add_outer(a: &mut SMatrix<f64, WITH_PART, WITH_PART>, weight: f64, v: &SVector<f64, WITH_PART>) {
+    let v = v.as_slice();
+    for (column, &of_column) in a.as_mut_slice().chunks_exact_mut(WITH_PART).zip(v) {
+        // What the other view has of its own is zero.
+        if of_column != 0.0 {
+            let w = weight * of_column;
+            column.iter_mut().zip(v).for_each(|(c, v)| *c += w * v);
+        }
     }
 }
 

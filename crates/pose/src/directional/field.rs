@@ -137,7 +137,7 @@ impl Plane {
         }
         // Distance across the line to a column k away.
         let step = f32::from(UNIT) / (1.0 + lean * lean).sqrt();
-        let prices = [1, 2, 4, 2].map(|k| (k, (step * k as f32) as u16));
+        let prices = [1, 2, FURTHEST, 2].map(|k| (k, (step * k as f32) as u16));
         spread(values, cols, &prices);
         let shift: Vec<i32> = (0..rows).map(|r| (r as f32 * lean).round() as i32).collect();
         let total: u64 = values.iter().map(|&v| u64::from(v)).sum();
@@ -157,14 +157,14 @@ impl Plane {
     /// down to and including row r.
     fn integrate(&mut self, values: &[u16]) {
         let cols = self.cols;
-        self.integral = vec![0; (self.rows + 1) * cols];
-        for r in 0..self.rows {
-            let (done, rest) = self.integral.split_at_mut((r + 1) * cols);
-            let target = &mut rest[..cols];
-            target.copy_from_slice(&values[r * cols..(r + 1) * cols]);
+        self.integral = Vec::with_capacity((self.rows + 1) * cols);
+        self.integral.resize(cols, 0);
+        for (r, row) in values.chunks_exact(cols).enumerate() {
+            self.integral.extend_from_slice(row);
             if r == 0 {
                 continue;
             }
+            let (done, target) = self.integral.split_at_mut((r + 1) * cols);
             let above = &done[r * cols..];
             match self.shift[r] - self.shift[r - 1] {
                 1 => add(&mut target[1..], &above[..cols - 1]),
@@ -202,18 +202,21 @@ impl Plane {
     }
 }
 
+/// Furthest step of [`spread`].
+const FURTHEST: usize = 4;
+
 /// `row[x] = min(row[x], row[x - k] + price, row[x + k] + price)` for every row, for each k in turn.
 #[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
 fn spread(values: &mut [u16], cols: usize, prices: &[(usize, u16)]) {
-    let mut spare = vec![0u16; cols];
+    // Beyond the border lies nothing: values that no price makes overflow or best.
+    let mut spare = vec![u16::MAX / 2; cols + 2 * FURTHEST];
     for row in values.chunks_exact_mut(cols) {
-        for &(k, price) in prices.iter().filter(|(k, _)| cols > 2 * k) {
-            spare.copy_from_slice(row);
-            for (value, from) in row[k..].iter_mut().zip(&spare[..cols - k]) {
-                *value = (*value).min(from + price);
-            }
-            for (value, from) in row[..cols - k].iter_mut().zip(&spare[k..]) {
-                *value = (*value).min(from + price);
+        for &(k, price) in prices {
+            spare[FURTHEST..FURTHEST + cols].copy_from_slice(row);
+            let left = &spare[FURTHEST - k..][..cols];
+            let right = &spare[FURTHEST + k..][..cols];
+            for ((value, &l), &r) in row.iter_mut().zip(left).zip(right) {
+                *value = (*value).min(l.min(r) + price);
             }
         }
     }

@@ -85,19 +85,37 @@ impl Level {
         ((u - self.origin.0 as f64 + 0.5) / s - 0.5, (v - self.origin.1 as f64 + 0.5) / s - 0.5)
     }
 
+    /// Smoothed grey values at `count` places from (x, y) on, each `step` further; not a number
+    /// where the level ends.
+    pub fn line(&self, (x, y): (f64, f64), step: (f64, f64), count: usize, out: &mut Vec<f32>) {
+        let last = (count - 1) as f64;
+        let whole = self.contains(x, y) && self.contains(x + step.0 * last, y + step.1 * last);
+        let (mut x, mut y) = (x as f32, y as f32);
+        let (dx, dy) = (step.0 as f32, step.1 as f32);
+        out.clear();
+        for _ in 0..count {
+            // A rectangle that holds both ends holds what lies between.
+            let inside = whole || self.contains(f64::from(x), f64::from(y));
+            out.push(if inside { self.value(x, y) } else { f32::NAN });
+            x += dx;
+            y += dy;
+        }
+    }
+
     /// Whether a position is far enough inside for interpolation.
-    pub fn contains(&self, x: f64, y: f64) -> bool {
+    fn contains(&self, x: f64, y: f64) -> bool {
         x >= 1.0 && y >= 1.0 && x < self.width() as f64 - 2.0 && y < self.height() as f64 - 2.0
     }
 
-    /// Smoothed grey value at a position that [`Level::contains`].
-    pub fn value(&self, x: f64, y: f64) -> f32 {
-        let (x0, y0) = (x as usize, y as usize);
-        let (fx, fy) = ((x - x0 as f64) as f32, (y - y0 as f64) as f32);
-        let i = y0 * self.width() + x0;
-        let [top, bottom] = [i, i + self.width()].map(|i| &self.smooth.data()[i..i + 2]);
-        let (top, bottom) =
-            (top[0] + fx * (top[1] - top[0]), bottom[0] + fx * (bottom[1] - bottom[0]));
+    /// Smoothed grey value at a position that the level contains, but for rounding.
+    fn value(&self, x: f32, y: f32) -> f32 {
+        let (x0, y0) = (x as i32, y as i32);
+        let (fx, fy) = (x - x0 as f32, y - y0 as f32);
+        let width = self.width();
+        let i = y0 as usize * width + x0 as usize;
+        let square = &self.smooth.data()[i..i + width + 2];
+        let top = square[0] + fx * (square[1] - square[0]);
+        let bottom = square[width] + fx * (square[width + 1] - square[width]);
         top + fy * (bottom - top)
     }
 

@@ -5,8 +5,8 @@
 //! refinement stops at the first place that fits: the likelihood has several tops. The refinement is
 //! started again from where the contour lies a few pixels off, in every direction in which a pose can
 //! move it. The distinct tops are components of a mixture: its mean is the estimate, its second moment
-//! about that, with the odds taken less seriously, the covariance. So a pose whose edges are certain gets a small one, and a
-//! pose that might sit on the wrong line of print says so.
+//! about that, with the odds taken less seriously, the covariance. So a pose whose edges are certain
+//! gets a small one, and a pose that might sit on the wrong line of print says so.
 
 use nalgebra::{Matrix6, Vector6};
 use vergence_geometry::Transform;
@@ -18,10 +18,11 @@ use super::verdict::Explained;
 
 /// How far the contour is moved (px of the working scale, which is at most two of the picture's).
 const HOP_PX: f64 = 2.5;
-/// A start that comes this near (px) to a known optimum with its first pass will end there.
-const CAUGHT_PX: f64 = 0.4;
-/// Optima whose contours are nearer than this (px) are one.
-const SAME_PX: f64 = 0.2;
+/// A start that comes this near (px) to a known optimum will end there.
+const CAUGHT_PX: f64 = 0.3;
+/// How a start is refined; before all passes are done most are caught.
+const PASSES: [Pass; 4] =
+    [Pass::new(1.0, 5.0, 4.0, true), Pass::new(0.6, 4.0, 2.5, true), FINAL, FINAL];
 /// A direction is left out when it takes more than this (rad or m) to move the contour that far: a
 /// turn about the axis of a solid of revolution.
 const BLIND: f64 = 0.2;
@@ -32,7 +33,7 @@ const DOUBT_NATS: f64 = 6.0;
 const MOST_BEHIND: f64 = 4.6;
 
 impl Search<'_> {
-    /// Moves to the best optimum nearby and widens the covariance by the others.
+    /// Moves to the mean of the optima nearby and widens the covariance by them.
     pub(super) fn settle(&self, best: &mut (Refined, Explained)) {
         let metric = contour_metric(&best.0);
         let apart = |a: &Refined, b: &Refined| {
@@ -42,12 +43,11 @@ impl Search<'_> {
         let mut optima = vec![best.clone()];
         for start in self.starts(&best.0, &metric) {
             let mut trial = Refined { pose: start, ..best.0.clone() };
-            self.refine(&mut trial, &[Pass::new(1.0, 5.0, 4.0, true)]);
-            if optima.iter().any(|o| apart(&o.0, &trial) < CAUGHT_PX) {
-                continue;
-            }
-            self.refine(&mut trial, &[Pass::new(0.6, 4.0, 2.5, true), FINAL, FINAL]);
-            if optima.iter().all(|o| apart(&o.0, &trial) > SAME_PX) {
+            let caught = PASSES.iter().any(|pass| {
+                self.refine(&mut trial, std::slice::from_ref(pass));
+                optima.iter().any(|o| apart(&o.0, &trial) < CAUGHT_PX)
+            });
+            if !caught {
                 optima.push(self.both(trial));
             }
         }

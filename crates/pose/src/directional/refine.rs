@@ -25,8 +25,8 @@ use crate::model::Kind;
 pub const EDGE_SD_PX: f64 = 0.2;
 /// The covariance takes the deviations of what sites have in common this much larger than the
 /// estimate does: the estimate is best with the core of their distribution, the covariance has to
-/// hold its tails (their root mean square is about twice the core, docs/pose.md).
-const DOUBT: f64 = 2.0;
+/// hold its tails (their root mean square is up to two and a half times the core, docs/pose.md).
+const DOUBT: f64 = 2.5;
 /// Neighbouring sites err alike: contour length that counts as one independent measurement, in the
 /// picture (px; blur and aliasing) and on the object (m; bent edges, shadows, lines of print).
 const CORRELATION_PX: f64 = 5.0;
@@ -124,9 +124,9 @@ impl Search<'_> {
         let views = self.sights.len();
         for pass in passes {
             self.lay_out(refined, pass);
-            // Two steps on the same sites: the assignments settle while the geometry is linear.
+            // Three steps on the same sites: the assignments settle while the geometry is linear.
             let mut moved = Move { shared: Vector7::zeros(), own: vec![Vector4::zeros(); views] };
-            for _ in 0..2 {
+            for _ in 0..3 {
                 let Some(step) = self.step(refined, pass, &moved, 1.0) else { break };
                 moved.shared += step.shared;
                 moved.own.iter_mut().zip(step.own).for_each(|(m, s)| *m += s);
@@ -376,10 +376,10 @@ fn assign(
         let place = if inner { place + lip_shift } else { place };
         for c in site.edges() {
             let r = c.offset - place - shift;
-            let local = sd.hypot(c.noise_px);
-            let total = local.hypot(common);
-            let likelihood = density * c.weight * (-0.5 * (r / total).powi(2)).exp() / total;
-            let weight = likelihood * sd * sd / (local * local);
+            let local = sd * sd + c.noise_px * c.noise_px;
+            let total = local + common * common;
+            let likelihood = density * c.weight * (-0.5 * r * r / total).exp() / total.sqrt();
+            let weight = likelihood * sd * sd / local;
             sum[0] += likelihood;
             sum[1] += weight * r;
             sum[2] += weight;

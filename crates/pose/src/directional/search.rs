@@ -120,11 +120,15 @@ impl Search<'_> {
             }
         }
         found.sort_by(|a, b| b.evidence.total_cmp(&a.evidence));
+        let least = found.first().map_or(0.0, |best| self.config.worth_a_climb * best.evidence);
+        found.retain(|h| h.evidence >= least);
         let mut seeds = distinct(&found, self.config.seeds, self.config.grid_spacing);
         for seed in &mut seeds {
             self.climb(seed, about, &mut scratch);
         }
         seeds.sort_by(|a, b| b.evidence.total_cmp(&a.evidence));
+        let least = seeds.first().map_or(0.0, |best| self.config.worth * best.evidence);
+        seeds.retain(|h| h.evidence >= least);
         let mut best = distinct(&seeds, count, 0.5 * self.config.grid_spacing);
         for hypothesis in &mut best {
             hypothesis.rests = about.is_some();

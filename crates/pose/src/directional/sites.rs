@@ -244,18 +244,14 @@ fn find_edges(site: &mut Site, level: &Level, range_px: f64, profile: &mut Vec<f
     let (nx, ny) = site.normal;
     let reach = (range_px / scale).ceil() as i32 + 1;
     // Slopes as differences of values half a pixel to either side. Outside the picture: none.
-    profile.clear();
-    let value = |k: i32| {
-        let offset = f64::from(k) - 0.5;
-        let (px, py) = (x + nx * offset, y + ny * offset);
-        level.contains(px, py).then(|| level.value(px, py))
-    };
-    let mut behind = value(-reach);
-    for k in -reach..=reach {
-        let ahead = value(k + 1);
-        profile.push(ahead.zip(behind).map_or(0.0, |(a, b)| a - b));
-        behind = ahead;
+    let before = f64::from(reach) + 0.5;
+    let count = 2 * reach as usize + 2;
+    level.line((x - nx * before, y - ny * before), (nx, ny), count, profile);
+    for k in 0..count - 1 {
+        let slope = profile[k + 1] - profile[k];
+        profile[k] = if slope.is_nan() { 0.0 } else { slope };
     }
+    profile.pop();
     let threshold = NOISE_FACTOR * level.noise;
     let mut strongest = 0.0f32;
     for i in 1..profile.len() - 1 {
