@@ -31,7 +31,7 @@ use verdict::Explained;
 
 /// Roughly refined poses that get their chance however far behind (nats) they are, and how far behind
 /// others may be: the rough contour of a tilted or hidden object may explain little.
-const SURE_FINALISTS: usize = 4;
+const SURE_FINALISTS: usize = 3;
 const BEHIND: f64 = 15.0;
 
 /// Alternatives reported.
