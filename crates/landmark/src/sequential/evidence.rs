@@ -8,6 +8,8 @@
 //! over a proper prior is a likelihood ratio again, so that Ville's bound holds for it:
 //! the chance of ever passing `exp(h)` without a tag is at most `exp(-h)`.
 
+use std::f64::consts::LN_2;
+
 use vergence_tag::Pattern;
 
 use super::nuisance::{Nuisance, dot};
@@ -204,17 +206,37 @@ fn log_ratio(freedom: f64, prior: f64, total: f64, correlation: f64, norm2: f64)
     if correlation <= 0.0 {
         return 0.0;
     }
-    let explained = (correlation * correlation / total).min(0.999_999);
-    let half = 0.5 * (freedom + prior);
-    let term = |(width, weight): (f64, f64)| {
+    let explained = correlation * correlation;
+    let by_width = |width: f64| {
         let gain = width * width * norm2;
-        weight.ln() - 0.5 * (1.0 + gain).ln() - half * (-explained * gain / (1.0 + gain)).ln_1p()
+        (0.5 * (1.0 + gain).ln(), explained * gain / (1.0 + gain))
     };
-    let terms = WIDTHS.map(term);
-    let largest = terms.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    let mean = terms.iter().map(|t| (t - largest).exp()).sum::<f64>();
     // Half-normal: the amplitude is positive, so the prior is twice as dense there.
-    largest + mean.ln() + std::f64::consts::LN_2
+    over_widths(0.5 * (freedom + prior), total, by_width) + LN_2
+}
+
+/// Log likelihood ratio of a model whose brightness is normal with a standard deviation in proportion
+/// to the width of the amplitude's prior, the mean over the widths. For each width `by_width` gives
+/// half the logarithm of the determinant of its covariance, relative to the noise, and the energy that
+/// it explains.
+pub fn over_prior(series: &Series, by_width: impl Fn(f64) -> (f64, f64)) -> f64 {
+    over_widths(0.5 * (series.freedom + NOISE_FRAMES), series.total(0.0), by_width)
+}
+
+fn over_widths(half: f64, total: f64, by_width: impl Fn(f64) -> (f64, f64)) -> f64 {
+    log_sum(&WIDTHS.map(|(width, weight)| {
+        let (log_det, explained) = by_width(width);
+        weight.ln() - log_det - half * (-explained / total).max(-0.999_999).ln_1p()
+    }))
+}
+
+/// Logarithm of the sum of the numbers whose logarithms are given.
+pub fn log_sum(terms: &[f64]) -> f64 {
+    let largest = terms.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    if largest == f64::NEG_INFINITY {
+        return largest;
+    }
+    largest + terms.iter().map(|t| (t - largest).exp()).sum::<f64>().ln()
 }
 
 /// By how much the log likelihood ratio of the best phase grows when phases between those of the bank

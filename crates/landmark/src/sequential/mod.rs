@@ -190,7 +190,7 @@ impl SequentialFinder {
 
     /// Log likelihood ratio that presence needs.
     fn presence(&self) -> f64 {
-        verdict::presence(self.size, self.requests.len(), self.config.false_alarm)
+        verdict::presence::presence(self.size, self.requests.len(), self.config.false_alarm)
     }
 
     /// The places whose light may be that of a pattern.

@@ -51,17 +51,10 @@ pub struct Bank {
 }
 
 impl Bank {
-    /// An empty bank for a window of so many frames, at the clock rates `rates`. `fine`: follow
-    /// changes of the light inside the exposure.
-    pub fn new(
-        pattern: &Pattern,
-        rates: &[f64],
-        times: &[(f64, f64)],
-        window: usize,
-        fine: bool,
-    ) -> Self {
+    /// An empty bank for a window of so many frames, at the clock rates `rates`.
+    pub fn new(pattern: &Pattern, rates: &[f64], times: &[(f64, f64)], window: usize) -> Self {
         let period = pattern.period().as_secs_f64();
-        let phases = (period / phase_step(pattern, times, fine)).ceil() as usize;
+        let phases = (period / phase_step(pattern, times)).ceil() as usize;
         let step = period / phases as f64;
         let hypotheses: Vec<Hypothesis> = rates
             .iter()
@@ -147,14 +140,14 @@ impl Bank {
 }
 
 /// Step of the phase in a bank (s).
-fn phase_step(pattern: &Pattern, times: &[(f64, f64)], fine: bool) -> f64 {
+fn phase_step(pattern: &Pattern, times: &[(f64, f64)]) -> f64 {
     let chip = pattern.chip.as_secs_f64();
     let between = gap(times).max(1e-4);
     let step = PHASE_STEP * chip.min(between).max(0.25 * chip);
     // Where a chip lasts a whole number of frames, every change falls at the same point of an
     // exposure: inside it, all frames are half lit, and only a step as fine as that tells.
     let frames = chip / between;
-    if fine && (frames - frames.round()).abs() < 0.05 * frames {
+    if (frames - frames.round()).abs() < 0.05 * frames {
         let exposure = times.first().map_or(0.0, |t| t.1);
         return step.min((0.25 * exposure).max(chip / 32.0));
     }
@@ -196,16 +189,6 @@ pub fn lines(patterns: &[&Pattern], times: &[(f64, f64)], nuisance: &Nuisance) -
     }
     let strong = strengths.iter().enumerate().filter(|(_, s)| **s > 0.3).map(|(k, _)| k + 1);
     orthonormal(first.period().as_secs_f64(), strong, times, |line| nuisance.remove(line))
-}
-
-/// The lines that any code of a pattern's length and chip may have, as an orthonormal set that
-/// `clear` has freed of nuisances.
-pub fn every_line(
-    pattern: &Pattern,
-    times: &[(f64, f64)],
-    clear: impl Fn(&mut [f32]),
-) -> Vec<Vec<f32>> {
-    orthonormal(pattern.period().as_secs_f64(), 1..=pattern.bits.len() / 2, times, clear)
 }
 
 /// Cosine and sine at multiples of the fundamental, orthonormal.
