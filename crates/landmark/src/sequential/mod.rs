@@ -258,9 +258,8 @@ impl Finder for SequentialFinder {
             let scan = self.frames >= self.next_scan;
             self.round(scan, false, frame.stamp);
             if scan {
-                // A full window gains no more evidence, it only forgets: half as often.
-                let every = if self.frames < window { self.frames / 4 } else { window / 2 };
-                self.next_scan = self.frames + every.max(8);
+                // A third more evidence; a full window gains none, it only forgets.
+                self.next_scan = self.frames + (self.frames / 3).clamp(FIRST_SCAN / 2, window / 2);
             }
         }
         Ok(())

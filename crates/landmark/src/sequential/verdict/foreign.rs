@@ -14,7 +14,7 @@
 
 use std::f64::consts::LN_2;
 
-use super::super::evidence::{Series, log_sum, over_prior, weigh};
+use super::super::evidence::{Evidence, Series, log_sum, over_prior, weigh};
 use super::super::history::History;
 use super::banks::Banks;
 use super::{Round, Seen};
@@ -49,15 +49,19 @@ impl Round<'_> {
         let Some(gap) = self.config.foreign_rate else { return true };
         let requests = self.requests.len() as f64;
         let lead = (KINDS * FOREIGN * requests / self.config.wrong_identity).ln();
-        let chips = self.flips(request, seen);
+        let (own, folds) = (seen.evidence.correlation.powi(2), self.folds(&seen.series));
+        // What the freest light leaves is noise; what the request leaves may be the other light.
+        let free = folds.iter().map(|f| (f.explained(), f.chips.len()));
+        let (explained, chips) = free.fold((own, 1), |a, b| if b.0 > a.0 { b } else { a });
+        let mut series = seen.series.settled(explained, chips);
+        series.noise += MODEL * own / series.freedom;
+        let chips = self.flips(request, &seen.evidence, &series);
         let kin = lead + self.same_chip(request, gap).ln();
         if chips.no_period() < kin || chips.another_code() < kin {
             return false;
         }
-        let mut series = seen.series.settled(&seen.evidence);
-        series.noise += MODEL * seen.evidence.correlation.powi(2) / series.freedom;
         let own = weigh(&series, banks.own(self, request), 0.0, &mut Vec::new());
-        let another_clock = self.another_clock(request, gap, &series);
+        let another_clock = self.another_clock(request, gap, &series, &folds);
         own.is_some_and(|own| own.log_ratio - another_clock >= lead)
     }
 
@@ -70,10 +74,8 @@ impl Round<'_> {
     }
 
     /// How likely each chip of a request was the other way round.
-    fn flips(&self, request: usize, seen: &Seen) -> Flips {
+    fn flips(&self, request: usize, evidence: &Evidence, series: &Series) -> Flips {
         let pattern = &self.requests[request].pattern;
-        let (evidence, series) = (&seen.evidence, seen.series.settled(&seen.evidence));
-        let noise = series.noise + MODEL * evidence.correlation.powi(2) / series.freedom;
         let times = self.history.times();
         let at = (evidence.best.phase, evidence.best.rate);
         let mut rest = Vec::new();
@@ -100,7 +102,7 @@ impl Round<'_> {
         let length = pattern.bits.len();
         let log_flip = |k: usize, [rest, light]: [f64; 2]| {
             let sign = if pattern.bits.chip(start as i64 + k as i64) { -1.0 } else { 1.0 };
-            (sign * amplitude * rest - 0.5 * amplitude * amplitude * light) / noise
+            (sign * amplitude * rest - 0.5 * amplitude * amplitude * light) / series.noise
         };
         let once: Vec<f64> =
             seen_chips.iter().enumerate().map(|(k, chip)| log_flip(k, *chip)).collect();
@@ -113,36 +115,44 @@ impl Round<'_> {
         Flips { once, folded, told, phases: length as f64 }
     }
 
-    /// Log likelihood ratio of a light of another chip than the request's: the mean over chips,
-    /// lengths of code and offsets.
-    fn another_clock(&self, request: usize, gap: f64, series: &Series) -> f64 {
-        let own = chip(&self.requests[request]);
-        let span = span(self.history);
-        // Nearer than this it is the request itself; codes of as many chips are told from it before.
-        let few = self.requests[request].pattern.bits.len() < FEWEST_CHIPS;
-        let apart = if few { gap } else { gap.min(step(own, span)) };
+    /// The series laid over itself with the chips and lengths of code that are reckoned with.
+    fn folds(&self, series: &Series) -> Vec<Fold> {
         let mut lengths: Vec<usize> = self.requests.iter().map(|r| r.pattern.bits.len()).collect();
         lengths.sort_unstable();
         lengths.dedup();
-        let mut fold = Fold::default();
-        let mut terms = Vec::new();
-        for &length in &lengths {
+        let times = self.history.times();
+        let mut folds = Vec::new();
+        for length in lengths {
             let of_length = self.requests.iter().filter(|r| r.pattern.bits.len() == length);
             let (short, long) =
                 of_length.map(chip).fold((f64::INFINITY, 0.0f64), |(a, b), c| (a.min(c), b.max(c)));
-            let chips = grid(short / SPREAD, long * SPREAD, span);
-            let chips: Vec<f64> =
-                chips.into_iter().filter(|c| (c / own - 1.0).abs() >= apart).collect();
-            let share = -((lengths.len() * chips.len() * OFFSETS) as f64).ln();
-            for chip in chips {
-                for k in 0..OFFSETS {
+            for chip in grid(short / SPREAD, long * SPREAD, span(self.history)) {
+                folds.extend((0..OFFSETS).map(|k| {
                     let offset = k as f64 / OFFSETS as f64;
-                    fold.take(&series.values, self.history.times(), chip, offset, length);
-                    terms.push(share + fold.log_ratio(series));
-                }
+                    Fold::new(&series.values, times, chip, offset, length)
+                }));
             }
         }
-        log_sum(&terms)
+        folds
+    }
+
+    /// Log likelihood ratio of a light of another chip than the request's: the mean over lengths,
+    /// chips and offsets.
+    fn another_clock(&self, request: usize, gap: f64, series: &Series, folds: &[Fold]) -> f64 {
+        let own = chip(&self.requests[request]);
+        // Nearer than this it is the request itself; codes of as many chips are told from it before.
+        let few = self.requests[request].pattern.bits.len() < FEWEST_CHIPS;
+        let apart = if few { gap } else { gap.min(step(own, span(self.history))) };
+        let others: Vec<&Fold> =
+            folds.iter().filter(|f| (f.chip / own - 1.0).abs() >= apart).collect();
+        let of_length = others.chunk_by(|a, b| a.chips.len() == b.chips.len());
+        let means: Vec<f64> = of_length
+            .map(|folds| {
+                let ratios: Vec<f64> = folds.iter().map(|f| f.log_ratio(series)).collect();
+                log_sum(&ratios) - (ratios.len() as f64).ln()
+            })
+            .collect();
+        log_sum(&means) - (means.len().max(1) as f64).ln()
     }
 }
 
@@ -210,33 +220,33 @@ fn log_one_plus_exp(x: f64) -> f64 {
     x.max(0.0) + (-x.abs()).exp().ln_1p()
 }
 
-/// A series laid over itself with some period: sum and number of frames of every chip.
-#[derive(Default)]
+/// A series laid over itself with some period.
 struct Fold {
+    /// Length of a chip (s).
+    chip: f64,
+    /// Sum and number of frames of every chip.
     chips: Vec<[f64; 2]>,
 }
 
 impl Fold {
     /// Lays `values` over itself with `length` chips of `chip` seconds; `offset`: share of a chip.
-    fn take(
-        &mut self,
-        values: &[f32],
-        times: &[(f64, f64)],
-        chip: f64,
-        offset: f64,
-        length: usize,
-    ) {
-        self.chips.clear();
-        self.chips.resize(length, [0.0; 2]);
+    fn new(values: &[f32], times: &[(f64, f64)], chip: f64, offset: f64, length: usize) -> Self {
+        let mut chips = vec![[0.0; 2]; length];
         let (per_second, period) = (1.0 / chip, length as f64);
         for (&(t, e), v) in times.iter().zip(values) {
             let position = (t + 0.5 * e) * per_second + offset;
             let turns = (position / period) as i64 as f64;
             let k = (position - turns * period) as usize;
-            let [sum, count] = &mut self.chips[k.min(length - 1)];
+            let [sum, count] = &mut chips[k.min(length - 1)];
             *sum += f64::from(*v);
             *count += 1.0;
         }
+        Fold { chip, chips }
+    }
+
+    /// Energy that the best brightness in each chip explains.
+    fn explained(&self) -> f64 {
+        self.chips.iter().map(|[sum, count]| sum * sum / count.max(1.0)).sum()
     }
 
     /// Log likelihood ratio when the chips' brightness is normal about their mean, with the standard
