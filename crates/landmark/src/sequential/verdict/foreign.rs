@@ -17,7 +17,7 @@ use std::f64::consts::LN_2;
 use super::super::evidence::{Evidence, Series, log_sum, over_prior, weigh};
 use super::super::history::History;
 use super::banks::Banks;
-use super::{Round, Seen};
+use super::{NOISE_SLACK, Round, Seen};
 use crate::Request;
 
 /// Foreign tags that a picture shows on average, where there may be any.
@@ -32,7 +32,7 @@ const SAME_CHIP: f64 = 1.0 / 32.0;
 
 /// Share of a light's power that is never quite as expected: edges between the phases of the bank,
 /// saturation, shake, JPEG.
-const MODEL: f64 = 0.05;
+const MODEL: f64 = 0.02;
 
 /// Codes of fewer chips have no other code beside them.
 const FEWEST_CHIPS: usize = 4;
@@ -50,10 +50,12 @@ impl Round<'_> {
         let requests = self.requests.len() as f64;
         let lead = (KINDS * FOREIGN * requests / self.config.wrong_identity).ln();
         let (own, folds) = (seen.evidence.correlation.powi(2), self.folds(&seen.series));
-        // What the freest light leaves is noise; what the request leaves may be the other light.
+        // What the freest light leaves is noise, but not when it is far beyond that of the surroundings:
+        // then it is light that none of them explains.
         let free = folds.iter().map(|f| (f.explained(), f.chips.len()));
         let (explained, chips) = free.fold((own, 1), |a, b| if b.0 > a.0 { b } else { a });
         let mut series = seen.series.settled(explained, chips);
+        series.noise = series.noise.min(NOISE_SLACK * seen.series.noise);
         series.noise += MODEL * own / series.freedom;
         let chips = self.flips(request, &seen.evidence, &series);
         let kin = lead + self.same_chip(request, gap).ln();
