@@ -40,6 +40,10 @@ const FEWEST_CHIPS: usize = 4;
 /// Chips up to this many times as long or short as those requested are reckoned with.
 const SPREAD: f64 = 1.5;
 
+/// Time (s) over which chips are told apart at most: a camera may pause, and the number of chips that a
+/// longer time tells apart grows without need.
+const LONGEST: f64 = 20.0;
+
 /// Offsets of the chips' edges that are tried, as shares of a chip.
 const OFFSETS: usize = 4;
 
@@ -78,43 +82,28 @@ impl Round<'_> {
     /// How likely each chip of a request was the other way round.
     fn flips(&self, request: usize, evidence: &Evidence, series: &Series) -> Flips {
         let pattern = &self.requests[request].pattern;
-        let times = self.history.times();
-        let at = (evidence.best.phase, evidence.best.rate);
+        let (phase, rate) = (evidence.best.phase, evidence.best.rate);
+        let (times, amplitude) = (self.history.times(), evidence.amplitude());
         let mut rest = Vec::new();
-        series.expect(pattern, times, at, self.nuisance, &mut rest);
-        let amplitude = evidence.amplitude();
+        series.expect(pattern, times, (phase, rate), self.nuisance, &mut rest);
         for (r, v) in rest.iter_mut().zip(&series.values) {
             *r = v - amplitude as f32 * *r;
         }
         let chip = chip(&self.requests[request]);
-        // Chips counted on from the first that the window shows.
-        let position = |t: f64| (at.0 + at.1 * t) / chip;
-        let start = times.first().map_or(0.0, |t| position(t.0)).floor();
-        let end = times.last().map_or(0.0, |t| position(t.0 + t.1)).floor();
-        let mut seen_chips = vec![[0.0; 2]; (end - start).max(0.0) as usize + 1];
-        for (&(t, e), r) in times.iter().zip(&rest) {
-            let (from, to) = (position(t) - start, position(t + e) - start);
-            for k in from as usize..=(to as usize).min(seen_chips.len() - 1) {
-                let within = to.min(k as f64 + 1.0) - from.max(k as f64);
-                let share = if to > from { within / (to - from) } else { 1.0 };
-                seen_chips[k][0] += share * f64::from(*r);
-                seen_chips[k][1] += share * share;
-            }
-        }
+        let position = |t: f64| (phase + rate * t) / chip;
+        let shares = times.iter().zip(&rest).map(|(&(t, e), r)| (position(t), position(t + e), *r));
         let length = pattern.bits.len();
-        let log_flip = |k: usize, [rest, light]: [f64; 2]| {
-            let sign = if pattern.bits.chip(start as i64 + k as i64) { -1.0 } else { 1.0 };
-            (sign * amplitude * rest - 0.5 * amplitude * amplitude * light) / series.noise
+        let mut folded = vec![0.0; length];
+        let flip = |ChipSeen { number, rest, light }: ChipSeen| {
+            let sign = if pattern.bits.chip(number) { -1.0 } else { 1.0 };
+            let flip = amplitude * (sign * rest - 0.5 * amplitude * light) / series.noise;
+            folded[number.rem_euclid(length as i64) as usize] += flip;
+            flip
         };
-        let once: Vec<f64> =
-            seen_chips.iter().enumerate().map(|(k, chip)| log_flip(k, *chip)).collect();
-        let mut folded = vec![0.0; length.min(once.len())];
-        for (k, flip) in once.iter().enumerate() {
-            folded[k % length] += flip;
-        }
+        let once = chips_seen(shares).into_iter().map(flip).collect();
         // What is projected out cannot speak against the request.
         let told = series.freedom / times.len().max(1) as f64;
-        Flips { once, folded, told, phases: length as f64 }
+        Flips { once, folded, told }
     }
 
     /// The series laid over itself with the chips and lengths of code that are reckoned with.
@@ -162,10 +151,11 @@ fn chip(request: &Request) -> f64 {
     request.pattern.chip.as_secs_f64()
 }
 
-/// Seconds from the first to the last frame of the window.
+/// Seconds from the first to the last frame of the window, pauses cut.
 fn span(history: &History) -> f64 {
     let times = history.times();
-    times.last().map_or(0.0, |l| l.0) - times.first().map_or(0.0, |f| f.0)
+    let span = times.last().map_or(0.0, |l| l.0) - times.first().map_or(0.0, |f| f.0);
+    span.min(LONGEST)
 }
 
 /// By how much, relative, a chip must differ for the edges to drift by half a chip over `span` seconds
@@ -185,23 +175,58 @@ fn grid(short: f64, long: f64, span: f64) -> Vec<f64> {
     chips
 }
 
+/// What the frames say about one chip.
+struct ChipSeen {
+    /// Its number, counted from the first of the pattern.
+    number: i64,
+    /// Sum of what the request leaves unexplained (grey levels).
+    rest: f64,
+    /// Squared length of the chip's light (frames).
+    light: f64,
+}
+
+/// The chips that frames show: each with the chips at which its exposure starts and ends, and what is
+/// unexplained.
+fn chips_seen(frames: impl Iterator<Item = (f64, f64, f32)>) -> Vec<ChipSeen> {
+    let mut seen: Vec<ChipSeen> = Vec::new();
+    for (from, to, rest) in frames {
+        for number in from.floor() as i64..=to.floor() as i64 {
+            let within = to.min(number as f64 + 1.0) - from.max(number as f64);
+            let share = if to > from { within / (to - from) } else { 1.0 };
+            let (rest, light) = (share * f64::from(rest), share * share);
+            // Exposures may share a chip, and no more than the last few.
+            match seen.iter_mut().rev().take_while(|s| s.number >= number).last() {
+                Some(s) if s.number == number => {
+                    s.rest += rest;
+                    s.light += light;
+                }
+                _ => seen.push(ChipSeen { number, rest, light }),
+            }
+        }
+    }
+    seen
+}
+
 /// Log likelihood ratios of every chip the other way round to the chip as requested.
 struct Flips {
-    /// Of every chip in the window.
+    /// Of every chip that the window shows.
     once: Vec<f64>,
-    /// Of every chip of the period.
+    /// Of every chip of the period; zero where it is not seen.
     folded: Vec<f64>,
     /// Share of the frames' information that the nuisances leave.
     told: f64,
-    /// Phases at which a code of chance may look like the request.
-    phases: f64,
 }
 
 impl Flips {
+    /// Phases at which a code of chance may look like the request (nats).
+    fn phases(&self) -> f64 {
+        (self.folded.len() as f64).ln()
+    }
+
     /// Lead of the request over chips of chance (nats).
     fn no_period(&self) -> f64 {
-        let told: f64 = self.once.iter().map(|f| LN_2 - log_one_plus_exp(*f)).sum();
-        self.told * told - self.phases.ln()
+        let lead: f64 = self.once.iter().map(|f| LN_2 - log_one_plus_exp(*f)).sum();
+        self.told * lead - self.phases()
     }
 
     /// Lead of the request over the codes of its length that differ in two chips or more (nats).
@@ -213,7 +238,7 @@ impl Flips {
         let all: f64 = self.folded.iter().map(|f| log_one_plus_exp(*f)).sum();
         let few = self.folded.iter().map(|f| (f - all).exp()).sum::<f64>() + (-all).exp();
         let others = all + (1.0 - few).max(f64::MIN_POSITIVE).ln();
-        self.folded.len() as f64 * LN_2 - self.phases.ln() - others
+        self.folded.len() as f64 * LN_2 - self.phases() - others
     }
 }
 
@@ -254,28 +279,93 @@ impl Fold {
     /// Log likelihood ratio when the chips' brightness is normal about their mean, with the standard
     /// deviations that lights of the amplitudes' priors have.
     fn log_ratio(&self, series: &Series) -> f64 {
+        // On and off lie half an amplitude either side of the mean.
+        over_prior(series, |width| self.normal(0.25 * width * width))
+    }
+
+    /// Half the logarithm of the determinant of the covariance relative to the noise, and the energy
+    /// explained, when the chips' variance is `gain` times that of the noise. The mean of the series is
+    /// zero: what all chips have in common is no evidence.
+    fn normal(&self, gain: f64) -> (f64, f64) {
         let frames: f64 = self.chips.iter().map(|c| c[1]).sum();
-        over_prior(series, |width| {
-            // On and off lie half an amplitude either side of the mean.
-            let gain = 0.25 * width * width;
-            let (mut log_det, mut explained) = (0.0, 0.0);
-            let (mut product, mut squares, mut sums) = (1.0f64, 0.0, 0.0);
-            for &[sum, count] in &self.chips {
-                let shrink = gain / (1.0 + gain * count);
-                product *= 1.0 + gain * count;
-                if product > 1e200 {
-                    log_det += product.ln();
-                    product = 1.0;
-                }
-                explained += shrink * sum * sum;
-                squares += shrink * count * count;
-                sums += shrink * sum * count;
+        let (mut log_det, mut product, mut explained) = (0.0, 1.0f64, 0.0);
+        let (mut squares, mut sums) = (0.0, 0.0);
+        for &[sum, count] in &self.chips {
+            let shrink = gain / (1.0 + gain * count);
+            product *= 1.0 + gain * count;
+            if product > 1e200 {
+                log_det += product.ln();
+                product = 1.0;
             }
-            // The mean is free: what all chips have in common is no evidence.
-            let rest = (1.0 - squares / frames).max(1e-9);
-            log_det += product.ln() + rest.ln();
-            explained += sums * sums / (frames * rest);
-            (0.5 * log_det, explained)
-        })
+            explained += shrink * sum * sum;
+            squares += shrink * count * count;
+            sums += shrink * sum * count;
+        }
+        // The mean that is taken out is a matrix of rank one (Sherman and Morrison).
+        let rest = (1.0 - squares / frames).max(1e-9);
+        log_det += product.ln() + rest.ln();
+        explained += sums * sums / (frames * rest);
+        (0.5 * log_det, explained)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::{DMatrix, DVector};
+
+    #[test]
+    fn a_normal_brightness_in_each_chip_is_weighed_as_by_matrices() {
+        let times: Vec<(f64, f64)> = (0..40).map(|k| (0.033 * k as f64, 0.005)).collect();
+        let mut values: Vec<f32> = (0..40).map(|k| ((k * k * 7) % 23) as f32).collect();
+        let mean = values.iter().sum::<f32>() / 40.0;
+        values.iter_mut().for_each(|v| *v -= mean);
+        let (chip, length, gain) = (0.061, 7, 3.0);
+        let fold = Fold::new(&values, &times, chip, 0.25, length);
+        let in_chip = |t: usize, k: usize| {
+            let position = (times[t].0 + 0.0025) / chip + 0.25;
+            f64::from(u8::from(position as usize % length == k))
+        };
+        let design = DMatrix::from_fn(40, length, in_chip);
+        let centred = &design - DMatrix::from_fn(40, length, |_, k| design.column(k).mean());
+        let covariance = DMatrix::identity(length, length) + gain * centred.transpose() * &centred;
+        let series = DVector::from_iterator(40, values.iter().map(|v| f64::from(*v)));
+        let product = centred.transpose() * series;
+        let inverse = covariance.clone().try_inverse().unwrap();
+        let explained = gain * (product.transpose() * inverse * &product)[(0, 0)];
+        let (half_log_det, energy) = fold.normal(gain);
+        assert!((half_log_det - 0.5 * covariance.determinant().ln()).abs() < 1e-9);
+        assert!((energy / explained - 1.0).abs() < 1e-6, "{energy} is not {explained}");
+    }
+
+    /// All other codes one by one, against the sum over sets of flipped chips.
+    #[test]
+    fn all_codes_with_two_other_chips_are_weighed() {
+        let folded = vec![-3.0, 0.5, -7.0, -1.0, -2.5];
+        let likelihood = |code: u32| -> f64 {
+            let flipped = (0..5).filter(|k| code >> k & 1 == 1);
+            flipped.map(|k| folded[k]).sum::<f64>().exp()
+        };
+        let others: f64 = (0..32u32).filter(|c| c.count_ones() >= 2).map(likelihood).sum();
+        let flips = Flips { once: Vec::new(), folded, told: 1.0 };
+        let lead = (1.0 / 5.0f64).ln() - (others / 32.0).ln();
+        assert!((flips.another_code() - lead).abs() < 1e-9, "{}", flips.another_code());
+    }
+
+    #[test]
+    fn chips_that_are_certain_count_a_bit_each() {
+        let flips = |f: f64| Flips { once: vec![f; 20], folded: vec![f; 8], told: 1.0 };
+        assert!((flips(-50.0).no_period() - (20.0 * LN_2 - 8f64.ln())).abs() < 1e-9);
+        assert!(flips(0.0).no_period() < 0.0, "chips of which nothing is known say nothing");
+        assert!(flips(2000.0).no_period() < -1e4, "no overflow");
+    }
+
+    #[test]
+    fn a_frame_is_shared_by_the_chips_of_its_exposure() {
+        let frames = [(-0.5, -0.25, 1.0), (0.75, 1.25, 4.0), (1.5, 1.5, 3.0), (1e9, 1e9, 2.0)];
+        let seen = chips_seen(frames.into_iter());
+        let found: Vec<_> = seen.iter().map(|s| (s.number, s.rest, s.light)).collect();
+        let expected = [(-1, 1.0, 1.0), (0, 2.0, 0.25), (1, 5.0, 1.25), (1_000_000_000, 2.0, 1.0)];
+        assert_eq!(found, expected);
     }
 }
