@@ -10,7 +10,7 @@
 //!
 //! The request must be as many times likelier than each kind as Ville's inequality asks for the lights
 //! that there may be. A light that plays the request gathers evidence against all three from its first
-//! frames; one that resembles it does not, however weak it is.
+//! frames, one that resembles it gathers evidence for one of them.
 
 use std::f64::consts::LN_2;
 
