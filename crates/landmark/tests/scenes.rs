@@ -7,10 +7,10 @@ use std::time::Duration;
 use nalgebra::Point2;
 use proptest::prelude::*;
 use vergence_imaging::Image;
-use vergence_landmark::sequential::SequentialFinder;
+use vergence_landmark::sequential::{Config, SequentialFinder};
 use vergence_landmark::synthetic::{Light, Patch, Scene};
 use vergence_landmark::{Decision, Finder, Request};
-use vergence_tag::Pattern;
+use vergence_tag::{Pattern, codebook};
 
 const SIDE: usize = 64;
 
@@ -180,6 +180,39 @@ fn more_is_found_than_by_a_plain_lock_in() {
         plain += usize::from(near(lock_in(&timed, &wanted.pattern)));
     }
     assert!(ours >= 5 && ours > plain, "ours {ours}, plain lock-in {plain} of 6");
+}
+
+/// Codes that nobody asked for, from faint to bright, on the chip of the requests. Without the lead that
+/// foreign lights demand, some pass for a request within their first chips.
+#[test]
+fn codes_that_nobody_asked_for_are_told_from_the_requested() {
+    let chip = Duration::from_millis(40);
+    let requests: Vec<Request> = (0..8)
+        .map(|k| {
+            let code = codebook::assign(k, 25.0).unwrap().bits;
+            let pattern = Pattern::new(code, chip).unwrap();
+            Request { id: k.to_string(), pattern, clock_tolerance: 2e-4 }
+        })
+        .collect();
+    let known: Vec<_> = requests.iter().map(|r| r.pattern.bits).collect();
+    let reports = |foreign_rate: Option<f64>| -> usize {
+        let report = |run: u64| {
+            let pattern = codebook::challenge(run, chip, &known).unwrap();
+            let amplitude = 4.0 * 1.2f64.powi(run as i32);
+            let place = Point2::new(20.3, 19.6);
+            let phase = 0.037 * run as f64;
+            let lights = vec![Light { place, amplitude, pattern, phase, rate: 1.0 }];
+            let scene = Scene { lights, frame_rate: 25.0, ..Scene::flat(40, 40) };
+            let config = Config { foreign_rate, ..Config::default() };
+            let mut finder = SequentialFinder::new(requests.clone(), config).unwrap();
+            let mut film = scene.film(run);
+            (0..100).for_each(|_| finder.push(&film.next_frame().unwrap()).unwrap());
+            finder.decisions().iter().filter(|d| d.brightest().is_some()).count()
+        };
+        (0..16).map(report).sum()
+    };
+    assert_eq!(reports(Config::default().foreign_rate), 0);
+    assert!(reports(None) > 0, "the scenes are too easy to show anything");
 }
 
 proptest! {

@@ -8,6 +8,8 @@
 //! over a proper prior is a likelihood ratio again, so that Ville's bound holds for it:
 //! the chance of ever passing `exp(h)` without a tag is at most `exp(-h)`.
 
+use std::f64::consts::LN_2;
+
 use vergence_tag::Pattern;
 
 use super::nuisance::{Nuisance, dot};
@@ -24,6 +26,13 @@ const WIDTHS: [(f64, f64); 3] = [(2.0, 0.8), (8.0, 0.15), (32.0, 0.05)];
 /// Standard deviations by which a place must be noisier than its neighbourhood to have noise of its
 /// own: less is chance, and taking the larger of the two every time would only cost frames.
 const OWN_NOISE: f64 = 1.5;
+
+/// Share of the floor that the best of the coarse phases must reach: at the worst, when every change
+/// of the light falls into an exposure, they show two thirds of it.
+const COARSE: f64 = 0.6;
+
+/// Degrees of freedom from which what is left over tells the noise.
+const FREE: f64 = 10.0;
 
 /// A deviation this many times the ninth decile of all deviations is cut to it: something passed.
 const CLIP: f32 = 3.0;
@@ -92,17 +101,21 @@ impl Series {
     /// Variance of the noise of this place when so much of its energy is a light. A place that stays
     /// noisier than its neighbourhood, by more than chance explains, has noise of its own.
     fn noise_beside(&self, explained: f64) -> f64 {
-        if self.settled {
-            return self.noise;
-        }
-        let own = (self.energy - explained).max(0.0) / self.freedom;
-        self.noise.max(own / (1.0 + OWN_NOISE * (2.0 / self.freedom).sqrt()))
+        if self.settled { self.noise } else { self.noise_left(explained, self.freedom) }
     }
 
-    /// The same series with the noise that it has beside the light of `evidence`, whatever it is
-    /// compared with: two explanations are weighed with one and the same noise.
-    pub fn settled(&self, evidence: &Evidence) -> Series {
-        let noise = self.noise_beside(evidence.correlation * evidence.correlation);
+    fn noise_left(&self, explained: f64, freedom: f64) -> f64 {
+        let own = (self.energy - explained).max(0.0) / freedom;
+        self.noise.max(own / (1.0 + OWN_NOISE * (2.0 / freedom).sqrt()))
+    }
+
+    /// The same series with the noise that it has beside a light of `numbers` free numbers that explains
+    /// so much of its energy, whatever it is compared with: explanations are weighed with one and the
+    /// same noise.
+    pub fn settled(&self, explained: f64, numbers: usize) -> Series {
+        let freedom = self.freedom + 1.0 - numbers as f64;
+        // With few frames beyond the free numbers, nothing is left to tell the noise by.
+        let noise = if freedom < FREE { self.noise } else { self.noise_left(explained, freedom) };
         Series { noise, settled: true, ..self.clone() }
     }
 }
@@ -147,51 +160,73 @@ impl Evidence {
 /// Weighs a series against a bank; `None` when no hypothesis of the bank is testable.
 ///
 /// Where even the best hypothesis falls short of `floor`, its value is returned instead of the mean:
-/// an upper bound, and cheaper.
+/// an upper bound, and cheaper. Where the best of the coarse phases falls far short of it, so does that.
 pub fn weigh(series: &Series, bank: &Bank, floor: f64, scratch: &mut Vec<f32>) -> Option<Evidence> {
-    bank.correlate(&series.values, scratch);
-    let kept = kept(series, bank);
-    // What the surroundings took from the expected light shortens it.
-    let share = |k: usize| kept.get(k).copied().unwrap_or(1.0);
-    for (k, c) in scratch.iter_mut().enumerate() {
-        *c /= share(k).sqrt();
+    let (coarse, _) = best(series, bank, bank.coarse, scratch)?;
+    if coarse.log_ratio < COARSE * floor {
+        return Some(coarse);
     }
-    let best = (0..scratch.len()).max_by(|&a, &b| scratch[a].total_cmp(&scratch[b]))?;
-    let scaled = |k: usize| {
-        let h = bank.hypotheses[k];
-        Hypothesis { norm2: h.norm2 * f64::from(share(k)), ..h }
-    };
-    let correlation = f64::from(scratch[best]);
-    let total = series.total(correlation * correlation);
-    let weigh = |c: f64, norm2: f64| log_ratio(series.freedom, NOISE_FRAMES, total, c, norm2);
-    let restless = |c: f64, norm2: f64| log_ratio(series.freedom, 0.0, series.energy, c, norm2);
-    let bound = weigh(correlation, scaled(best).norm2);
-    let restless_bound = restless(correlation, scaled(best).norm2);
-    let evidence =
-        Evidence { log_ratio: bound, restless: restless_bound, best: scaled(best), correlation };
-    if bound < floor {
-        return Some(evidence);
+    let (best, kept) = best(series, bank, bank.hypotheses.len(), scratch)?;
+    if best.log_ratio < floor {
+        return Some(best);
     }
     let (mut sum, mut restless_sum) = (0.0, 0.0);
     for (k, c) in scratch.iter().enumerate().filter(|(_, c)| **c > 0.0) {
-        let (c, norm2) = (f64::from(*c), scaled(k).norm2);
-        sum += (weigh(c, norm2) - bound).exp();
-        restless_sum += (restless(c, norm2) - restless_bound).exp();
+        let (c, norm2) = (f64::from(*c), scaled(bank, &kept, k).norm2);
+        let (log_ratio, restless) = log_ratios(series, best.correlation, c, norm2);
+        sum += (log_ratio - best.log_ratio).exp();
+        restless_sum += (restless - best.restless).exp();
     }
     let count = bank.hypotheses.len() as f64;
-    let log_ratio = bound + (sum / count).ln();
-    Some(Evidence { log_ratio, restless: restless_bound + (restless_sum / count).ln(), ..evidence })
+    let log_ratio = best.log_ratio + (sum / count).ln();
+    Some(Evidence { log_ratio, restless: best.restless + (restless_sum / count).ln(), ..best })
+}
+
+/// The best of the first `count` hypotheses, and what the surroundings leave of each; `scratch` holds
+/// the scalar products afterwards.
+fn best(
+    series: &Series,
+    bank: &Bank,
+    count: usize,
+    scratch: &mut Vec<f32>,
+) -> Option<(Evidence, Vec<f32>)> {
+    bank.correlate(&series.values, count, scratch);
+    let kept = kept(series, bank, count);
+    // What the surroundings took from the expected light shortens it.
+    for (c, share) in scratch.iter_mut().zip(&kept) {
+        *c /= share.sqrt();
+    }
+    let best = (0..count).max_by(|&a, &b| scratch[a].total_cmp(&scratch[b]))?;
+    let (correlation, best) = (f64::from(scratch[best]), scaled(bank, &kept, best));
+    let (log_ratio, restless) = log_ratios(series, correlation, correlation, best.norm2);
+    Some((Evidence { log_ratio, restless, best, correlation }, kept))
+}
+
+/// A hypothesis with what the surroundings leave of its light.
+fn scaled(bank: &Bank, kept: &[f32], k: usize) -> Hypothesis {
+    let h = bank.hypotheses[k];
+    Hypothesis { norm2: h.norm2 * f64::from(kept.get(k).copied().unwrap_or(1.0)), ..h }
+}
+
+/// Log likelihood ratios of one phase and rate against the noise around and that of a restless place;
+/// `best`: the correlation of the best.
+fn log_ratios(series: &Series, best: f64, correlation: f64, norm2: f64) -> (f64, f64) {
+    let total = series.total(best * best);
+    (
+        log_ratio(series.freedom, NOISE_FRAMES, total, correlation, norm2),
+        log_ratio(series.freedom, 0.0, series.energy, correlation, norm2),
+    )
 }
 
 /// Share of each hypothesis' light (squared length) that the surroundings leave; empty: all.
-fn kept(series: &Series, bank: &Bank) -> Vec<f32> {
+fn kept(series: &Series, bank: &Bank, count: usize) -> Vec<f32> {
     if series.local.is_empty() {
         return Vec::new();
     }
-    let mut kept = vec![1.0f32; bank.hypotheses.len()];
+    let mut kept = vec![1.0f32; count];
     let mut shares = Vec::new();
     for course in &series.local {
-        bank.correlate(course, &mut shares);
+        bank.correlate(course, count, &mut shares);
         kept.iter_mut().zip(&shares).for_each(|(k, s)| *k -= s * s);
     }
     // Below a tenth nothing trustworthy is left.
@@ -204,17 +239,37 @@ fn log_ratio(freedom: f64, prior: f64, total: f64, correlation: f64, norm2: f64)
     if correlation <= 0.0 {
         return 0.0;
     }
-    let explained = (correlation * correlation / total).min(0.999_999);
-    let half = 0.5 * (freedom + prior);
-    let term = |(width, weight): (f64, f64)| {
+    let explained = correlation * correlation;
+    let by_width = |width: f64| {
         let gain = width * width * norm2;
-        weight.ln() - 0.5 * (1.0 + gain).ln() - half * (-explained * gain / (1.0 + gain)).ln_1p()
+        (0.5 * (1.0 + gain).ln(), explained * gain / (1.0 + gain))
     };
-    let terms = WIDTHS.map(term);
-    let largest = terms.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-    let mean = terms.iter().map(|t| (t - largest).exp()).sum::<f64>();
     // Half-normal: the amplitude is positive, so the prior is twice as dense there.
-    largest + mean.ln() + std::f64::consts::LN_2
+    over_widths(0.5 * (freedom + prior), total, by_width) + LN_2
+}
+
+/// Log likelihood ratio of a model whose brightness is normal with a standard deviation in proportion
+/// to the width of the amplitude's prior, the mean over the widths. For each width `by_width` gives
+/// half the logarithm of the determinant of its covariance, relative to the noise, and the energy that
+/// it explains.
+pub fn over_prior(series: &Series, by_width: impl Fn(f64) -> (f64, f64)) -> f64 {
+    over_widths(0.5 * (series.freedom + NOISE_FRAMES), series.total(0.0), by_width)
+}
+
+fn over_widths(half: f64, total: f64, by_width: impl Fn(f64) -> (f64, f64)) -> f64 {
+    log_sum(&WIDTHS.map(|(width, weight)| {
+        let (log_det, explained) = by_width(width);
+        weight.ln() - log_det - half * (-explained / total).max(-0.999_999).ln_1p()
+    }))
+}
+
+/// Logarithm of the sum of the numbers whose logarithms are given.
+pub fn log_sum(terms: &[f64]) -> f64 {
+    let largest = terms.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    if largest == f64::NEG_INFINITY {
+        return largest;
+    }
+    largest + terms.iter().map(|t| (t - largest).exp()).sum::<f64>().ln()
 }
 
 /// By how much the log likelihood ratio of the best phase grows when phases between those of the bank

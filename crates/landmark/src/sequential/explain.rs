@@ -80,8 +80,8 @@ pub fn explain(
     let size = frames.first().map_or((0, 0), |f| (f.image.width(), f.image.height()));
     Ok(Explanation {
         map: whole.map(&requests[request], size),
-        presence: verdict::presence(size, requests.len(), config.false_alarm),
-        margin: verdict::margin(requests.len() - 1, config.wrong_identity),
+        presence: verdict::presence::presence(size, requests.len(), config.false_alarm),
+        margin: verdict::identity::margin(requests.len() - 1, config.wrong_identity),
         samples: whole.samples(place, &requests[request]),
         course,
     })
@@ -125,7 +125,7 @@ impl Watcher {
         let times = self.history.times();
         let span = times.last().map_or(0.0, |t| t.0);
         let rates = rates(&request.pattern, request.clock_tolerance, span);
-        let mut bank = Bank::new(&request.pattern, &rates, times, self.history.len(), true);
+        let mut bank = Bank::new(&request.pattern, &rates, times, self.history.len());
         bank.fit(times, self.history.numbers(), &self.nuisance);
         bank
     }

@@ -118,17 +118,15 @@ impl History {
         out.extend(self.frames.iter().map(|p| f32::from(p.filtered.row(y)[x]) * scale));
     }
 
-    /// The same for many pixels of one row, one after the other in `out`: frame by frame, so that
-    /// memory is read in the order in which it lies.
-    pub fn series_of_row(&self, y: usize, columns: &[usize], out: &mut Vec<f32>) {
-        let n = self.frames.len();
+    /// Change of brightness since the first frame of the window for many pixels of one row, frame by
+    /// frame for all pixels: memory is read and written in the order in which it lies.
+    pub fn changes_of_row(&self, y: usize, columns: &[usize], out: &mut Vec<f32>) {
         out.clear();
-        out.resize(n * columns.len(), 0.0);
-        for (t, past) in self.frames.iter().enumerate() {
+        let Some(first) = self.frames.front().map(|p| p.filtered.row(y)) else { return };
+        for past in &self.frames {
             let row = past.filtered.row(y);
-            for (k, &x) in columns.iter().enumerate() {
-                out[k * n + t] = f32::from(row[x]) * (1.0 / GAIN);
-            }
+            let change = |&x: &usize| f32::from(row[x].wrapping_sub(first[x])) * (1.0 / GAIN);
+            out.extend(columns.iter().map(change));
         }
     }
 }

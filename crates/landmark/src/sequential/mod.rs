@@ -11,8 +11,8 @@
 //!    sides;
 //! 5. [`evidence`]: a likelihood ratio with amplitude, phase and noise averaged over;
 //! 6. [`verdict`]: presence by Ville's bound over the whole picture, margin over every other requested
-//!    pattern and over look-alikes at other rates, quality of the fit; absence when a tag of the least
-//!    contrast would have been found.
+//!    pattern and over lights that nobody asked for; absence when a tag of the least contrast would
+//!    have been found.
 //!
 //! A rolling shutter needs no row time: phase is free at every place, and a place lies on one row.
 //! Memory is a window of frames of constant length. The mathematics is that of `docs/landmark.md`.
@@ -58,8 +58,9 @@ pub struct Config {
     pub wrong_identity: f64,
     /// A tag of this contrast (grey levels) would have been found before "absent" is said.
     pub least_contrast: f64,
-    /// Blinkers whose clock differs by this much (relative) and more are told from the tag. It costs
-    /// the time in which that difference shows; `None` where nothing foreign can blink a code.
+    /// A foreign light that plays a requested pattern is told from the tag when its clock differs by
+    /// this much (relative) and more. `None` where nothing blinks but what is requested: decisions need
+    /// fewer frames then.
     pub foreign_rate: Option<f64>,
 }
 
@@ -190,7 +191,7 @@ impl SequentialFinder {
 
     /// Log likelihood ratio that presence needs.
     fn presence(&self) -> f64 {
-        verdict::presence(self.size, self.requests.len(), self.config.false_alarm)
+        verdict::presence::presence(self.size, self.requests.len(), self.config.false_alarm)
     }
 
     /// The places whose light may be that of a pattern.
@@ -258,9 +259,8 @@ impl Finder for SequentialFinder {
             let scan = self.frames >= self.next_scan;
             self.round(scan, false, frame.stamp);
             if scan {
-                // A full window gains no more evidence, it only forgets: half as often.
-                let every = if self.frames < window { self.frames / 4 } else { window / 2 };
-                self.next_scan = self.frames + every.max(8);
+                // A third more evidence; a full window gains none, it only forgets.
+                self.next_scan = self.frames + (self.frames / 3).clamp(FIRST_SCAN / 2, window / 2);
             }
         }
         Ok(())

@@ -52,6 +52,11 @@ impl Nuisance {
         self.basis.len()
     }
 
+    /// The orthonormal basis.
+    pub fn basis(&self) -> &[Vec<f32>] {
+        &self.basis
+    }
+
     /// Frames of the window.
     pub fn frames(&self) -> usize {
         self.frames
@@ -67,10 +72,18 @@ impl Nuisance {
         }
     }
 
-    /// Squared length of a time course once the nuisances are taken out.
-    pub fn rest2(&self, course: &[f32]) -> f32 {
-        let taken: f32 = self.basis.iter().map(|vector| dot(vector, course).powi(2)).sum();
-        (dot(course, course) - taken).max(0.0)
+    /// Squared length of every column of a table of time courses once the nuisances are taken out;
+    /// `scratch` is overwritten.
+    pub fn rest2(&self, table: &[f32], width: usize, scratch: &mut Vec<f32>, out: &mut Vec<f32>) {
+        out.resize(width, 0.0);
+        scratch.resize(width, 0.0);
+        squares_of_columns(table, width, out);
+        for vector in &self.basis {
+            dot_columns(vector, table, width, scratch);
+            for (rest, share) in out.iter_mut().zip(scratch.iter()) {
+                *rest = (*rest - share * share).max(0.0);
+            }
+        }
     }
 
     fn add(&mut self, mut vector: Vec<f32>) {
@@ -185,4 +198,42 @@ pub fn dot(a: &[f32], b: &[f32]) -> f32 {
         }
     }
     lanes.iter().sum::<f32>() + tail
+}
+
+/// Columns that are added up side by side.
+const BLOCK: usize = 16;
+
+/// Scalar product of `vector` with the first columns of a table of rows of `width` numbers, as many
+/// rows as the vector is long: many series, or many expected lights, side by side.
+#[multiversion::multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
+pub fn dot_columns(vector: &[f32], table: &[f32], width: usize, out: &mut [f32]) {
+    let mut blocks = out.chunks_exact_mut(BLOCK);
+    let mut from = 0;
+    for out in &mut blocks {
+        let mut sums = [0.0f32; BLOCK];
+        for (v, row) in vector.iter().zip(table.chunks_exact(width)) {
+            let row = &row[from..from + BLOCK];
+            for k in 0..BLOCK {
+                sums[k] += v * row[k];
+            }
+        }
+        out.copy_from_slice(&sums);
+        from += BLOCK;
+    }
+    for (k, out) in blocks.into_remainder().iter_mut().enumerate() {
+        let column = table.iter().skip(from + k).step_by(width);
+        *out = vector.iter().zip(column).map(|(v, t)| v * t).sum();
+    }
+}
+
+/// Squared length of every column of a table, see [`dot_columns`].
+#[multiversion::multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
+pub fn squares_of_columns(table: &[f32], width: usize, out: &mut [f32]) {
+    let out = &mut out[..width];
+    out.fill(0.0);
+    for row in table.chunks_exact(width) {
+        for (sum, v) in out.iter_mut().zip(row) {
+            *sum += v * v;
+        }
+    }
 }

@@ -11,7 +11,7 @@ use std::ops::Range;
 
 use super::front::{GAIN, NOISE_GAIN};
 use super::history::History;
-use super::nuisance::{Nuisance, dot};
+use super::nuisance::{Nuisance, dot_columns, squares_of_columns};
 
 /// Side of a block (px).
 pub const BLOCK: usize = 16;
@@ -187,7 +187,10 @@ pub fn by_lines(
     let n = history.len();
     let limit = chi_square(n, least_excess(n, presence));
     let mut best: Vec<Best> = families.iter().map(|f| Best::of(f.requests.len())).collect();
-    let (mut table, mut columns) = (Vec::new(), Vec::with_capacity(width / 2));
+    let vectors = families.iter().flat_map(|f| &f.lines).chain(nuisance.basis());
+    let vectors: Vec<&[f32]> = vectors.map(Vec::as_slice).collect();
+    let (mut series, mut columns) = (Vec::new(), Vec::with_capacity(width / 2));
+    let (mut shares, mut totals) = (Vec::new(), Vec::new());
     let mut limits = vec![0.0; width];
     for y in MARGIN..height - MARGIN {
         if y == MARGIN || y % BLOCK == 0 {
@@ -195,16 +198,33 @@ pub fn by_lines(
         }
         columns.clear();
         peaks(energy, width, y, &limits, &mut columns);
-        history.series_of_row(y, &columns, &mut table);
-        for (series, &x) in table.chunks_exact_mut(n.max(1)).zip(&columns) {
-            nuisance.remove(series);
-            let total = dot(series, series) + 40.0 * noise.at(x, y) as f32;
+        let count = columns.len();
+        if count == 0 {
+            continue;
+        }
+        history.changes_of_row(y, &columns, &mut series);
+        totals.resize(count, 0.0);
+        squares_of_columns(&series, count, &mut totals);
+        shares.resize(count * vectors.len(), 0.0);
+        for (vector, share) in vectors.iter().zip(shares.chunks_exact_mut(count)) {
+            dot_columns(vector, &series, count, share);
+            share.iter_mut().for_each(|s| *s *= *s);
+        }
+        // The lines are free of nuisances, so that these need taking out of the total only.
+        let lines: usize = families.iter().map(|f| f.lines.len()).sum();
+        for (k, &x) in columns.iter().enumerate() {
+            let taken = shares[lines * count..].iter().skip(k).step_by(count);
+            let total = totals[k] - taken.sum::<f32>() + 40.0 * noise.at(x, y) as f32;
+            let mut from = 0;
             for (family, best) in families.iter().zip(&mut best) {
-                let explained: f32 = family.lines.iter().map(|l| dot(l, series).powi(2)).sum();
+                let to = from + family.lines.len();
+                let own = shares[from * count..to * count].iter().skip(k).step_by(count);
+                let explained = own.sum::<f32>();
                 let freedom = n as f32 + 40.0;
                 // Twice the log likelihood ratio, less what the number of lines gains by chance.
                 let score = -freedom * (-explained / total).ln_1p() - family.lines.len() as f32;
                 best.keep(score, (x, y));
+                from = to;
             }
         }
     }

@@ -5,7 +5,7 @@ use std::ops::Range;
 
 use vergence_tag::Pattern;
 
-use super::nuisance::{Nuisance, dot};
+use super::nuisance::{Nuisance, dot, dot_columns};
 
 /// Finest step of the phase in the bank, as a share of a chip or of the time between frames.
 const PHASE_STEP: f64 = 0.25;
@@ -29,21 +29,23 @@ pub struct Hypothesis {
     pub norm2: f64,
 }
 
-/// The expected light for all phases and rates of one pattern. It grows by a column a frame: nothing
-/// is computed twice.
+/// The expected light for all phases and rates of one pattern. It grows by a row a frame: nothing is
+/// computed twice.
 #[derive(Debug, Clone)]
 pub struct Bank {
     pattern: Pattern,
     /// The hypotheses; `norm2` is that of the last [`Bank::fit`].
     pub hypotheses: Vec<Hypothesis>,
-    /// Share of light, `capacity` frames a hypothesis, of which the used are in `used`.
+    /// So many come first that are a quarter of a chip apart: enough for a look.
+    pub coarse: usize,
+    /// Share of light, frame by frame for all hypotheses.
     templates: Vec<f32>,
-    capacity: usize,
-    used: Range<usize>,
-    /// Numbers of the frames in `used`, counted from the first frame ever.
+    /// Frames of `templates` that have left the window.
+    left: usize,
+    /// Longest window (frames).
+    window: usize,
+    /// Numbers of the frames of the window, counted from the first frame ever.
     frames: Range<usize>,
-    /// Frame number for which the lengths were computed.
-    fitted: usize,
     /// Reciprocal length of every expected light, nuisances taken out; zero where too short.
     scales: Vec<f32>,
     /// Step of the phase (s).
@@ -51,34 +53,28 @@ pub struct Bank {
 }
 
 impl Bank {
-    /// An empty bank for a window of so many frames, at the clock rates `rates`. `fine`: follow
-    /// changes of the light inside the exposure.
-    pub fn new(
-        pattern: &Pattern,
-        rates: &[f64],
-        times: &[(f64, f64)],
-        window: usize,
-        fine: bool,
-    ) -> Self {
+    /// An empty bank for a window of so many frames, at the clock rates `rates`.
+    pub fn new(pattern: &Pattern, rates: &[f64], times: &[(f64, f64)], window: usize) -> Self {
         let period = pattern.period().as_secs_f64();
-        let phases = (period / phase_step(pattern, times, fine)).ceil() as usize;
+        let phases = (period / phase_step(pattern, times)).ceil() as usize;
         let step = period / phases as f64;
-        let hypotheses: Vec<Hypothesis> = rates
-            .iter()
-            .flat_map(|&rate| (0..phases).map(move |k| (k as f64 * step, rate)))
-            .map(|(phase, rate)| Hypothesis { phase, rate, norm2: 0.0 })
-            .collect();
-        // Twice the window: the past is moved back to the start once a window, not every frame.
-        let capacity = 2 * window;
+        let stride = ((PHASE_STEP * pattern.chip.as_secs_f64() / step) as usize).max(1);
+        let coarse = |k: &usize| k.is_multiple_of(stride);
+        let (first, rest): (Vec<usize>, Vec<usize>) = (0..phases).partition(coarse);
+        let at = |k: usize, rate: f64| Hypothesis { phase: k as f64 * step, rate, norm2: 0.0 };
+        let of = |phases: &[usize]| -> Vec<Hypothesis> {
+            rates.iter().flat_map(|&rate| phases.iter().map(move |&k| at(k, rate))).collect()
+        };
+        let hypotheses = [of(&first), of(&rest)].concat();
         Bank {
             pattern: *pattern,
-            templates: vec![0.0; capacity * hypotheses.len()],
+            templates: Vec::new(),
             scales: vec![0.0; hypotheses.len()],
+            coarse: first.len() * rates.len(),
             hypotheses,
-            capacity,
-            used: 0..0,
+            left: 0,
+            window,
             frames: 0..0,
-            fitted: 0,
             step,
         }
     }
@@ -92,69 +88,60 @@ impl Bank {
     /// Brings the bank up to a window whose frames have the numbers `frames` (from the first frame
     /// ever) and whose nuisances are given.
     pub fn fit(&mut self, times: &[(f64, f64)], frames: Range<usize>, nuisance: &Nuisance) {
-        if self.fitted == frames.end {
+        if self.frames == frames {
             return;
         }
-        self.fitted = frames.end;
         self.advance(times, frames);
-        for ((h, scale), light) in self
-            .hypotheses
-            .iter_mut()
-            .zip(&mut self.scales)
-            .zip(self.templates.chunks_exact(self.capacity))
-        {
-            let norm2 = nuisance.rest2(&light[self.used.clone()]);
+        let (mut scratch, mut rest) = (Vec::new(), Vec::new());
+        nuisance.rest2(self.table(), self.hypotheses.len(), &mut scratch, &mut rest);
+        for ((h, scale), norm2) in self.hypotheses.iter_mut().zip(&mut self.scales).zip(rest) {
             h.norm2 = f64::from(norm2);
             // A phase whose light never changes within the window says nothing.
             *scale = if norm2 > 1e-3 { norm2.sqrt().recip() } else { 0.0 };
         }
     }
 
+    /// The rows of the window.
+    fn table(&self) -> &[f32] {
+        &self.templates[self.left * self.hypotheses.len()..]
+    }
+
     /// Drops the frames that left the window and adds those that entered.
     fn advance(&mut self, times: &[(f64, f64)], frames: Range<usize>) {
-        let known = self.frames.start..self.frames.end.max(frames.start);
-        let dropped = frames.start.saturating_sub(known.start).min(self.used.len());
-        self.used.start += dropped;
-        let new = &times[times.len() - (frames.end - known.end).min(times.len())..];
-        if self.used.end + new.len() > self.capacity {
-            let used = self.used.clone();
-            for light in self.templates.chunks_exact_mut(self.capacity) {
-                light.copy_within(used.clone(), 0);
-            }
-            self.used = 0..used.len();
+        let width = self.hypotheses.len();
+        let known = self.frames.end.max(frames.start);
+        self.left += (frames.start - self.frames.start).min(self.frames.len());
+        // The past is thrown away once a window, not every frame.
+        if self.left >= self.window {
+            self.templates.drain(..self.left * width);
+            self.left = 0;
         }
-        let at = self.used.end;
-        for (h, light) in self.hypotheses.iter().zip(self.templates.chunks_exact_mut(self.capacity))
-        {
-            for (value, &(t, e)) in light[at..].iter_mut().zip(new) {
-                *value = self.pattern.on_fraction(h.phase + h.rate * t, h.rate * e) as f32;
-            }
+        for &(t, e) in &times[times.len() - (frames.end - known).min(times.len())..] {
+            let share =
+                |h: &Hypothesis| self.pattern.on_fraction(h.phase + h.rate * t, h.rate * e) as f32;
+            self.templates.extend(self.hypotheses.iter().map(share));
         }
-        self.used.end += new.len();
         self.frames = frames;
     }
 
-    /// Scalar product of a series that is free of nuisances with every expected light of unit length.
-    pub fn correlate(&self, series: &[f32], out: &mut Vec<f32>) {
-        out.clear();
-        let lights = self.templates.chunks_exact(self.capacity);
-        out.extend(
-            lights
-                .zip(&self.scales)
-                .map(|(light, scale)| dot(&light[self.used.clone()], series) * scale),
-        );
+    /// Scalar product of a series that is free of nuisances with the first `count` expected lights, of
+    /// unit length.
+    pub fn correlate(&self, series: &[f32], count: usize, out: &mut Vec<f32>) {
+        out.resize(count, 0.0);
+        dot_columns(series, self.table(), self.hypotheses.len(), out);
+        out.iter_mut().zip(&self.scales).for_each(|(product, scale)| *product *= scale);
     }
 }
 
 /// Step of the phase in a bank (s).
-fn phase_step(pattern: &Pattern, times: &[(f64, f64)], fine: bool) -> f64 {
+fn phase_step(pattern: &Pattern, times: &[(f64, f64)]) -> f64 {
     let chip = pattern.chip.as_secs_f64();
     let between = gap(times).max(1e-4);
     let step = PHASE_STEP * chip.min(between).max(0.25 * chip);
     // Where a chip lasts a whole number of frames, every change falls at the same point of an
     // exposure: inside it, all frames are half lit, and only a step as fine as that tells.
     let frames = chip / between;
-    if fine && (frames - frames.round()).abs() < 0.05 * frames {
+    if (frames - frames.round()).abs() < 0.05 * frames {
         let exposure = times.first().map_or(0.0, |t| t.1);
         return step.min((0.25 * exposure).max(chip / 32.0));
     }
@@ -196,16 +183,6 @@ pub fn lines(patterns: &[&Pattern], times: &[(f64, f64)], nuisance: &Nuisance) -
     }
     let strong = strengths.iter().enumerate().filter(|(_, s)| **s > 0.3).map(|(k, _)| k + 1);
     orthonormal(first.period().as_secs_f64(), strong, times, |line| nuisance.remove(line))
-}
-
-/// The lines that any code of a pattern's length and chip may have, as an orthonormal set that
-/// `clear` has freed of nuisances.
-pub fn every_line(
-    pattern: &Pattern,
-    times: &[(f64, f64)],
-    clear: impl Fn(&mut [f32]),
-) -> Vec<Vec<f32>> {
-    orthonormal(pattern.period().as_secs_f64(), 1..=pattern.bits.len() / 2, times, clear)
 }
 
 /// Cosine and sine at multiples of the fundamental, orthonormal.

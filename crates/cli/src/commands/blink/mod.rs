@@ -7,6 +7,7 @@ mod bound;
 mod picture;
 mod report;
 mod request;
+mod tag_free;
 
 use std::path::{Path, PathBuf};
 use std::time::Instant;
