@@ -167,9 +167,13 @@ pub struct RadioConfig {
     /// Host and port of a Bluetooth controller that speaks H4 over TCP.
     #[serde(default)]
     pub tcp: Option<String>,
-    /// Serial line of a Bluetooth controller, its speed and raw mode set.
+    /// Serial line of a Bluetooth controller.
     #[serde(default)]
     pub device: Option<PathBuf>,
+    /// Speed of that line (baud). The one of Zephyr's `hci_uart`, which most boards run, when left out;
+    /// a line over USB knows none.
+    #[serde(default = "default_baud")]
+    pub baud: u32,
     /// Number of a Bluetooth controller of this computer (0 is `hci0`), taken from the kernel's own
     /// host ("user channel"): it must be off, bluetoothd stopped; needs CAP_NET_ADMIN.
     #[serde(default)]
@@ -188,6 +192,10 @@ pub struct RadioConfig {
     /// Refuse to find objects whose records are not signed by one of them.
     #[serde(default)]
     pub require_signature: bool,
+}
+
+fn default_baud() -> u32 {
+    1_000_000
 }
 
 impl Config {
