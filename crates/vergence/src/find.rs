@@ -11,6 +11,7 @@ use std::time::Duration;
 
 use vergence_devices::{Advertisement, DeviceError, LedCommand, Side, TagAddress};
 use vergence_geometry::{GaussianPoint, Symmetry, Transform};
+use vergence_head::ReaimConfig;
 use vergence_imaging::Frame;
 use vergence_landmark::FinderError;
 use vergence_pose::{ObjectPose, Query, Refusal, View};
@@ -56,11 +57,9 @@ pub struct FindConfig {
     pub link_tries: usize,
     /// Searches that are started when a light turned out not to be the tag's.
     pub search_tries: usize,
-    /// Standard deviation of the landmark's distance that is good enough (m): aiming again ends there.
-    pub depth_sigma: f64,
-    /// Most times that the heads aim again to average over the encoders' steps; the paper's method
-    /// never does.
-    pub reaims: usize,
+    /// When the heads stop aiming again to see through the encoders' steps; the paper's method never
+    /// begins.
+    pub reaim: ReaimConfig,
     /// Seed for the choice of patterns.
     pub seed: u64,
 }
@@ -73,8 +72,7 @@ impl Default for FindConfig {
             link_timeout: Duration::from_secs(2),
             link_tries: 3,
             search_tries: 3,
-            depth_sigma: 0.002,
-            reaims: 16,
+            reaim: ReaimConfig::default(),
             seed: 0,
         }
     }
@@ -99,8 +97,8 @@ pub(crate) enum Stop {
     Lost(&'static str),
     #[error("the two heads do not see one and the same light: {0}")]
     Triangulation(#[from] vergence_head::TriangulateError),
-    #[error("the pictures were refused: {0}")]
-    Frames(#[from] FinderError),
+    #[error("the {0} camera's pictures were refused: {1}")]
+    Frames(&'static str, FinderError),
     #[error("{0}")]
     Refused(#[from] Refusal),
     #[error("{0}")]
@@ -146,7 +144,7 @@ impl Stop {
             Stop::Triangulation(_) => {
                 "look for mirrors near the object; if it happens everywhere, calibrate the heads"
             }
-            Stop::Frames(_) => "check the camera's format and its time stamps",
+            Stop::Frames(..) => "check the camera's format and its time stamps",
             Stop::Refused(_) => {
                 "free the view of the object, add light, or check the record's size and shape"
             }
