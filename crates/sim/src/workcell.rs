@@ -222,6 +222,19 @@ impl Workcell {
         lock(&self.world).place_object(id, base_from_object)
     }
 
+    /// Holds a tagged object upright so that its first light is at a place (base, m) and shines towards
+    /// the foot of the heads' mast, as a person would who calibrates. `false` when there is no such light.
+    pub fn hold_light(&self, id: &str, place: &Point3<f64>) -> bool {
+        let world = &mut *lock(&self.world);
+        let record = world.objects.iter().map(|object| &object.record);
+        let held = record.into_iter().find(|record| record.object_id.as_str() == id);
+        let Some(site) = held.and_then(|record| record.landmarks.first()) else { return false };
+        let yaw = (-place.y).atan2(-place.x) - site.normal[1].atan2(site.normal[0]);
+        let turned = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw);
+        let centre = place.coords - turned * Vector3::from(site.position);
+        world.place_object(id, &Transform::from_parts(centre.into(), turned))
+    }
+
     /// Shows the arm's parts where they are now, in place of where they were; the cameras see them
     /// from the next picture on.
     pub fn show_arm(&self, parts: &[ArmPart]) {

@@ -2,6 +2,7 @@
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::time::{Duration, Instant};
 
 use clap::Args;
@@ -13,11 +14,13 @@ use vergence_sim::{WiredWorkcell, Workcell, fitting_servo};
 
 use crate::failure::Failure;
 use crate::interrupt::Interrupt;
+use crate::light::coordinates;
 use crate::robot::RobotArgs;
 
 /// Offer the simulated workcell's devices over the wires of real ones: servos on a pseudo-terminal,
 /// cameras as MJPEG over HTTP, tags behind Bluetooth controllers on TCP. Runs in real time until
-/// it is interrupted.
+/// it is interrupted. A line "OBJECT X Y Z" on standard input holds that object's light there (m, base),
+/// shining towards the heads: for `vergence calibrate` over the wires.
 #[derive(Args)]
 pub struct Sim {
     #[command(flatten)]
@@ -60,11 +63,38 @@ pub fn run(args: &Sim) -> Result<bool, Failure> {
         write_config(&wired, path, &urdf)?;
     }
     print(args, &wired)?;
+    let lines = typed();
     let start = Instant::now();
     while !interrupt.raised() && lasting.is_none_or(|lasting| start.elapsed() < lasting) {
-        std::thread::sleep(POLL);
+        match lines.recv_timeout(POLL) {
+            Ok(line) => hold(&wired, &line),
+            Err(RecvTimeoutError::Timeout) => {}
+            // Nobody types: the devices stay.
+            Err(RecvTimeoutError::Disconnected) => std::thread::sleep(POLL),
+        }
     }
     Ok(true)
+}
+
+/// What is typed, line by line.
+fn typed() -> Receiver<String> {
+    let (sender, lines) = channel();
+    std::thread::spawn(move || {
+        let mut typed = std::io::stdin().lines().map_while(Result::ok);
+        while typed.next().is_some_and(|line| sender.send(line).is_ok()) {}
+    });
+    lines
+}
+
+/// Holds a light where a line says; a line that says nothing is answered with what it should say.
+fn hold(wired: &WiredWorkcell, line: &str) {
+    let said =
+        line.trim().split_once(' ').and_then(|(object, at)| Some((object, coordinates(at)?)));
+    match said {
+        Some((object, at)) if wired.hold_light(object, &at) => eprintln!("{object} is held"),
+        Some((object, _)) => eprintln!("there is no object \"{object}\" with a light"),
+        None => eprintln!("type OBJECT X Y Z, for example: cup 0.8 0.1 0.3"),
+    }
 }
 
 /// The model that the wiring names for the left head, else the one nearest to the settings.
