@@ -16,6 +16,11 @@ const POLL: Duration = Duration::from_millis(10);
 const SLEW_SLACK: Duration = Duration::from_secs(2);
 /// Longest wait for one picture.
 const FRAME_TIMEOUT: Duration = Duration::from_secs(2);
+/// How far from its goal a servo may rest beside its step (rad): friction keeps small ones half a degree off.
+const SHORT_OF_GOAL: f64 = 0.03;
+/// How far a stamp may lie ahead of the robot's clock: a picture of the future was stamped by a clock that
+/// was set, and may show the head before it came to rest.
+const AHEAD: Duration = Duration::from_millis(100);
 /// Pictures that may have been exposed before the heads stood still, at the most.
 const STALE_FRAMES: usize = 30;
 
@@ -123,6 +128,7 @@ impl System {
             self.robot.clock.sleep(POLL);
             let joints = self.joints()?;
             if joints.iter().all(|j| !j.moving) {
+                self.arrived(&targets, &joints)?;
                 return Ok(joints);
             }
             if self.robot.clock.now() > deadline {
@@ -133,6 +139,32 @@ impl System {
                 });
             }
         }
+    }
+
+    /// Fails when a head rests elsewhere than it was sent to.
+    fn arrived(
+        &self,
+        targets: &[Option<[f64; 2]>; 2],
+        joints: &[JointReading; 2],
+    ) -> Result<(), DeviceError> {
+        for k in 0..2 {
+            let Some(target) = targets[k].map(|angles| self.heads[k].clamp(angles)) else {
+                continue;
+            };
+            let off = [joints[k].pan - target[0], joints[k].tilt - target[1]];
+            let allowed = SHORT_OF_GOAL + self.robot.heads[k].pan_tilt.resolution();
+            if let Some(joint) = (0..2).find(|&joint| off[joint].abs() > allowed) {
+                return Err(DeviceError::Fault {
+                    device: format!("{} head", Side::BOTH[k].name()),
+                    fault: format!(
+                        "{} rests {:.1} degrees from where it was sent to",
+                        ["pan", "tilt"][joint],
+                        off[joint].abs().to_degrees()
+                    ),
+                });
+            }
+        }
+        Ok(())
     }
 
     /// Pictures of both heads that were taken together, at most `apart` from each other, and not
@@ -163,13 +195,20 @@ impl System {
         self.robot.heads[side].camera.skip_before(since);
         for _ in 0..STALE_FRAMES {
             let frame = self.robot.heads[side].camera.next_frame(FRAME_TIMEOUT)?;
+            if frame.stamp > self.robot.clock.now() + AHEAD {
+                return Err(untimely(side, "ahead of"));
+            }
             if frame.stamp >= since {
                 return Ok(frame);
             }
         }
-        Err(DeviceError::Fault {
-            device: format!("{} camera", Side::BOTH[side].name()),
-            fault: "its time stamps lie behind the robot's clock".into(),
-        })
+        Err(untimely(side, "behind"))
+    }
+}
+
+fn untimely(side: usize, how: &str) -> DeviceError {
+    DeviceError::Fault {
+        device: format!("{} camera", Side::BOTH[side].name()),
+        fault: format!("its time stamps lie {how} the robot's clock"),
     }
 }

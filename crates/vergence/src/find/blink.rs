@@ -70,14 +70,15 @@ impl Run<'_> {
         joints: [Option<JointReading>; 2],
     ) -> Result<[Vec<Sighting>; 2], Stop> {
         let start = self.system.robot.clock.now();
-        let mut finders = [self.finder(pattern)?, self.finder(pattern)?];
+        let finder = |side: Side| self.finder(pattern).map_err(|e| Stop::Frames(side.name(), e));
+        let mut finders = [finder(Side::Left)?, finder(Side::Right)?];
         let mut open = joints.map(|j| j.is_some());
         while open.contains(&true) && self.system.robot.clock.now() < start + LONGEST_WATCH {
             for side in 0..2 {
                 let Some(reading) = joints[side].filter(|_| open[side]) else { continue };
                 let frame = self.system.frame_since(side, start)?;
                 self.observer.notice(&Event::Frame(Side::BOTH[side], &frame, reading));
-                finders[side].push(&frame)?;
+                finders[side].push(&frame).map_err(|e| Stop::Frames(Side::BOTH[side].name(), e))?;
                 open[side] = !finders[side].is_done();
             }
         }
