@@ -74,6 +74,9 @@ pub struct GraspReport {
     /// What was between the fingers when they had closed (m).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub closed_width: Option<f64>,
+    /// Why the first try ended, when there was a second.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub first_failure: Option<String>,
     /// Part of the arm that touched something on its way.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub contact: Option<String>,
