@@ -4,14 +4,17 @@
 // Helpers outside of test functions fail a test by panicking, too.
 #![allow(clippy::unwrap_used)]
 
-use std::io::Read;
+use std::io::{Read, Write};
 use std::path::PathBuf;
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use nalgebra::{Point3, Vector3};
 use serde_json::Value;
-use vergence_sim::{WiredWorkcell, Workcell, embedded_files, fitting_servo, settings};
+use vergence_sim::{
+    GeometryError, WiredWorkcell, Workcell, embedded_files, fitting_servo, settings,
+};
 
 /// No run may take longer, whatever happens to its devices.
 const BOUND: Duration = Duration::from_secs(180);
@@ -29,11 +32,17 @@ struct Bench {
 
 impl Bench {
     fn start(name: &str) -> Self {
+        Self::built(name, GeometryError::default())
+    }
+
+    /// With heads that are not as described.
+    fn built(name: &str, geometry_error: GeometryError) -> Self {
         let turn = TURN.lock().unwrap_or_else(PoisonError::into_inner);
         let (config, description) = embedded_files().unwrap();
         let mut settings = settings(&config).unwrap();
         let model = fitting_servo(settings.servos.resolution_deg);
         settings.servos.resolution_deg = model.tick.to_degrees();
+        settings.geometry_error = geometry_error;
         let urdf = description.text.clone();
         let workcell = Workcell::new(config, description, settings, 3).unwrap();
         let wired = WiredWorkcell::start(workcell, model).unwrap();
@@ -49,9 +58,19 @@ impl Bench {
     }
 
     fn find(&self) -> Child {
+        self.find_with("wired.toml")
+    }
+
+    fn find_with(&self, config: &str) -> Child {
+        self.run(&["find", "cup", "--config", config])
+    }
+
+    fn run(&self, arguments: &[&str]) -> Child {
         Command::new(env!("CARGO_BIN_EXE_vergence"))
-            .args(["find", "cup", "--json", "--config"])
-            .arg(self.folder.join("wired.toml"))
+            .args(arguments)
+            .arg("--json")
+            .current_dir(&self.folder)
+            .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
             .spawn()
@@ -108,6 +127,56 @@ fn the_cup_is_found_over_wires() {
     let off = (told - cup.base_from_object.translation.vector).norm();
     assert!(off < 0.015, "off by {:.1} mm", 1e3 * off);
     assert!(bench.torque_is_off(), "the torque is released at the end");
+}
+
+/// Waits until the program asks for the light at its next place.
+fn asks(child: &mut Child) {
+    const PROMPT: &[u8] = b"(q ends) ";
+    let stderr = child.stderr.as_mut().unwrap();
+    let (mut said, mut byte) = (Vec::new(), [0]);
+    while stderr.read(&mut byte).unwrap() == 1 {
+        said.push(byte[0]);
+        if said.ends_with(PROMPT) {
+            return;
+        }
+    }
+    panic!("ends before it has seen all places: {}", String::from_utf8_lossy(&said));
+}
+
+#[test]
+fn heads_that_are_not_as_described_are_calibrated_over_wires() {
+    let errors = GeometryError { joint_zero_deg: 1.0, focal_ratio: 0.03, ..Default::default() };
+    let bench = Bench::built("calibrated", errors);
+    let (places, views, out) = (["--places", "8"], ["--views", "8"], ["--out", "better.toml"]);
+    let what = ["calibrate", "--config", "wired.toml", "--measured"];
+    let mut child = bench.run(&[&what[..], &places, &views, &out].concat());
+    let at = |bearing: f64, distance: f64, height: f64| {
+        Point3::new(distance * bearing.cos(), distance * bearing.sin(), height)
+    };
+    // Near and far, left and right, high and low; the second of a pair half a metre from the first.
+    let pairs = [
+        (at(-0.4, 0.7, 0.2), Vector3::new(0.3, 0.4, 0.0)),
+        (at(0.2, 1.3, 0.5), Vector3::new(-0.3, -0.4, 0.0)),
+        (at(0.45, 0.8, 0.4), Vector3::new(0.0, -0.5, 0.0)),
+        (at(-0.35, 1.4, 0.15), Vector3::new(-0.4, 0.0, 0.3)),
+    ];
+    for place in pairs.into_iter().flat_map(|(first, way)| [first, first + way]) {
+        asks(&mut child);
+        assert!(bench.wired().hold_light("cup", &place));
+        let typed = format!("{} {} {}\n", place.x, place.y, place.z);
+        child.stdin.as_mut().unwrap().write_all(typed.as_bytes()).unwrap();
+    }
+    let (status, told) = ended(child);
+    assert_eq!(status, Some(0), "{told}");
+    assert!(bench.wired().hold_light("cup", &at(0.1, 0.9, 0.2)));
+    let off = |config: &str| {
+        let (_, report) = ended(bench.find_with(config));
+        let told = &report["landmark"]["position"];
+        let told = Point3::from([0, 1, 2].map(|k| told[k].as_f64().unwrap_or(f64::INFINITY)));
+        (told - at(0.1, 0.9, 0.2)).norm()
+    };
+    let (before, after) = (off("wired.toml"), off("better.toml"));
+    assert!(before > 0.03 && after < 0.012, "{before} m before, {after} m after");
 }
 
 #[test]

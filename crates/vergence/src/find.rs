@@ -25,7 +25,7 @@ use crate::system::System;
 mod blink;
 mod centre;
 mod collect;
-mod reaim;
+pub(crate) mod reaim;
 pub(crate) mod search;
 
 pub use collect::{CollectConfig, CollectError, LightMover, Placed, Session, collect};
@@ -222,6 +222,8 @@ pub(crate) struct Run<'a> {
     pub(crate) observer: &'a mut dyn Observer,
     timeline: Vec<Step>,
     pub(crate) landmark: Option<LandmarkReport>,
+    /// Who answered on the radio.
+    pub(crate) heard: Vec<Advertisement>,
     /// Time between two pictures, known when the tag blinks.
     interval: Duration,
 }
@@ -239,6 +241,7 @@ impl<'a> Run<'a> {
             observer,
             timeline: Vec::new(),
             landmark: None,
+            heard: Vec::new(),
             interval: Duration::ZERO,
         }
     }
@@ -249,7 +252,7 @@ impl Run<'_> {
     pub(crate) fn all(&mut self, object: &str) -> Result<Found, Stop> {
         let tag = self.step("radio", |run| run.radio(object))?;
         let record = self.step("record", |run| run.record(&tag))?;
-        let pattern = self.step("blink", |run| run.start_blinking(tag.address))?;
+        let pattern = self.step("blink", |run| run.start_blinking(tag.address, 0))?;
         let landmark = self.locate(tag.address, pattern);
         // The light must go out whether or not it was seen: for the pictures, and for the battery.
         let stopped = self.step("stop", |run| run.command(tag.address, LedCommand::Stop));
@@ -336,6 +339,7 @@ impl Run<'_> {
     fn radio(&mut self, object: &str) -> Result<Advertisement, Stop> {
         let heard = self.system.robot.radio.scan(self.config.scan_window)?;
         self.observer.notice(&Event::Heard(&heard));
+        self.heard.clone_from(&heard);
         let mut wanted = heard.iter().filter(|tag| tag.object_id == object);
         match (wanted.next(), wanted.count()) {
             (Some(tag), 0) => Ok(tag.clone()),
@@ -349,7 +353,7 @@ impl Run<'_> {
     }
 
     /// The object's record, checked against what the tag advertised.
-    fn record(&mut self, tag: &Advertisement) -> Result<Record, Stop> {
+    pub(crate) fn record(&mut self, tag: &Advertisement) -> Result<Record, Stop> {
         let timeout = self.config.link_timeout;
         let bytes = self.retry(|radio| radio.read_record(tag.address, timeout))?;
         let verdict = self.system.required_signers.as_ref().map(|keys| keys.judge(&bytes));

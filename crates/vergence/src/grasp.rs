@@ -27,8 +27,8 @@ use nalgebra::{Translation3, Vector3};
 use vergence_devices::{DeviceError, Execution, GripCommand, GripperReading, MotionLimits, Side};
 use vergence_geometry::{Solid, Trajectory, Transform};
 use vergence_grasp::{
-    LiftVerdict, Obstacle, Plan, Refusal, Request, correct, next_best, plan, turn_in_sight,
-    verify_lift,
+    LiftVerdict, Obstacle, Plan, Refusal, Request, correct, next_best, plan, relative_to_hand,
+    turn_in_sight, verify_lift,
 };
 
 use look::Sight;
@@ -193,7 +193,7 @@ impl Attempt<'_, '_> {
         if self.report.first_failure.is_none() {
             self.step("transfer", |a| a.transfer(planned))?;
         }
-        let again = self.step("look again", Self::look_again)?;
+        let again = self.step("look again", |a| a.look_again(hand))?;
         self.run.observer.notice(&Event::Stage("pregrasp"));
         let corrected = self.step("correct", |a| a.correct(hand, planned, &again))?;
         self.describe(&corrected);
@@ -283,17 +283,31 @@ impl Attempt<'_, '_> {
         self.play("transfer", &plan.transfer, &self.config.limits.clone())
     }
 
-    /// The landmark is measured anew and the object recognised anew, from where the heads stand. The
-    /// plan was sure enough of the first look, so that holds when the second gives nothing.
-    fn look_again(&mut self) -> Result<Found, Failure> {
-        match self.run.again(self.found) {
-            Ok(found) => Ok(found),
-            Err(Stop::Device(error)) => Err(error.into()),
+    /// The landmark is measured anew and the object recognised anew, and placed beside the hand when that has
+    /// a light. The plan was sure enough of the first look, so that holds when the second gives nothing.
+    fn look_again(&mut self, hand: &Hand) -> Result<Found, Failure> {
+        let mut found = match self.run.again(self.found) {
+            Ok(found) => found,
+            Err(Stop::Device(error)) => return Err(error.into()),
             Err(stop) => {
                 self.report.second_look = Some(stop.to_string());
-                Ok(self.found.clone())
+                return Ok(self.found.clone());
             }
+        };
+        let Some(light) = &hand.light else { return Ok(found) };
+        let joints = self.arm()?.read(ANSWER)?.positions;
+        match self.run.hand_beside(light, &joints, &found) {
+            Ok(sight) => {
+                let pose = &mut found.object.pose;
+                // What the pose is unsure of beside what the heads get wrong is not told apart: all stays.
+                let unsure = pose.covariance.fixed_view::<3, 3>(3, 3) + sight.difference;
+                *pose = relative_to_hand(pose, &sight.by_joints, &sight.seen, &unsure);
+                self.report.hand_off_mm = Some(1e3 * (sight.by_joints - sight.seen).norm());
+            }
+            Err(Stop::Device(error)) => return Err(error.into()),
+            Err(stop) => self.report.hand_unseen = Some(stop.to_string()),
         }
+        Ok(found)
     }
 
     fn close(&mut self, plan: &Plan) -> Result<(), Failure> {

@@ -6,6 +6,7 @@ use std::time::Duration;
 use vergence_devices::{
     Config, Description, DescriptionError, DeviceError, JointReading, Robot, Side,
 };
+use vergence_geometry::Chain;
 use vergence_head::PanTiltHead;
 use vergence_imaging::Frame;
 use vergence_tag::signature::TrustedKeys;
@@ -60,20 +61,36 @@ pub struct System {
 pub struct Hand {
     /// Kinematics, solids and gripper.
     pub robot: vergence_grasp::Robot,
+    /// The tag on the gripper, when there is one.
+    pub light: Option<HandLight>,
+}
+
+/// The tag on a gripper.
+#[derive(Clone)]
+pub struct HandLight {
+    /// Object id that it advertises.
+    pub object_id: String,
+    /// From base to the frame of its record, over the arm's joints.
+    pub chain: Chain,
 }
 
 /// The links that every description of an arm has.
 const ARM_LINKS: [&str; 3] = ["base", "tcp", "hand"];
 
 impl Hand {
-    /// Reads the links `tcp` and `hand` of a description.
-    pub fn read(description: &Description) -> Result<Self, SystemError> {
+    /// Reads the links `tcp` and `hand` of a description, and that of the gripper's tag.
+    pub fn read(config: &Config, description: &Description) -> Result<Self, SystemError> {
         let [base, tcp, hand] = ARM_LINKS;
         let chain = description.chain(base, tcp)?;
         let bodies = description.bodies(base, &chain)?;
         let gripper = description.gripper(hand)?;
         let robot = vergence_grasp::Robot::new(chain, &bodies, gripper.travel, gripper.effort)?;
-        Ok(Hand { robot })
+        let tag = config.arm.as_ref().and_then(|arm| arm.tag.as_ref());
+        let light = tag.map(|tag| {
+            let chain = description.chain(base, &tag.link)?;
+            Ok::<_, DescriptionError>(HandLight { object_id: tag.object_id.clone(), chain })
+        });
+        Ok(Hand { robot, light: light.transpose()? })
     }
 }
 
@@ -92,7 +109,7 @@ impl System {
                 .map(|chain| PanTiltHead { chain, camera: wiring.camera.model() })
                 .map_err(|source| SystemError::Description { side: side.name(), source })
         };
-        let hand = robot.arm.is_some().then(|| Hand::read(description)).transpose()?;
+        let hand = robot.arm.is_some().then(|| Hand::read(config, description)).transpose()?;
         let heads = [head(Side::Left)?, head(Side::Right)?];
         Ok(System { robot, heads, required_signers: None, hand })
     }

@@ -116,7 +116,7 @@ impl Run<'_> {
         session: &mut Session,
     ) -> Result<(), Stop> {
         while let Some(placed) = mover.next_place()? {
-            let pattern = self.step("blink", |run| run.start_blinking(tag))?;
+            let pattern = self.step("blink", |run| run.start_blinking(tag, 0))?;
             let looked = self.step("look around", |run| run.look_until_seen(tag, &pattern, views));
             let place = match looked {
                 // One place out of sight, or beside a mirror, does not undo the others.

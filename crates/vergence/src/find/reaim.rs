@@ -68,7 +68,7 @@ impl Run<'_> {
     }
 
     /// Angle noise when every joint comes from below.
-    fn noise_from_below(&self) -> Noise {
+    pub(crate) fn noise_from_below(&self) -> Noise {
         let servos = self.system.robot.heads.iter().map(|head| &head.pan_tilt);
         let slack = servos.fold(0.0, |slack: f64, servo| slack.max(servo.backlash()));
         Noise { common_sigma: LAG.1 * slack, ..self.noise() }
@@ -104,7 +104,7 @@ impl Run<'_> {
     }
 
     /// Where the camera is when the motor came from below.
-    pub(super) fn camera_angles(&self, side: usize, reading: &JointReading) -> [f64; 2] {
+    pub(crate) fn camera_angles(&self, side: usize, reading: &JointReading) -> [f64; 2] {
         let lag = LAG.0 * self.system.robot.heads[side].pan_tilt.backlash();
         [reading.pan - lag, reading.tilt - lag]
     }
@@ -131,7 +131,7 @@ impl Run<'_> {
 
 /// The angles, within `most` (rad) of the fixation's, at which a point is seen where the fixation saw
 /// it: Newton on the projection. `None` when there are none.
-fn settle(
+pub(crate) fn settle(
     head: &PanTiltHead,
     fixation: &Fixation,
     point: &Point3<f64>,
