@@ -334,3 +334,74 @@ pub fn hand(config: &Wiring, description: &Description) -> Result<Hand, Failure>
         )
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use vergence::GraspConfig;
+    use vergence_sim::Scenario;
+
+    use super::*;
+    use crate::robot::Opened;
+
+    /// An arm that stops half way of one motion, as if it had touched something.
+    struct Stopped {
+        arm: Box<dyn Arm>,
+        motions: usize,
+        at: usize,
+    }
+
+    impl Arm for Stopped {
+        fn joint_names(&self) -> [String; 6] {
+            self.arm.joint_names()
+        }
+
+        fn read(&mut self, timeout: Duration) -> Result<ArmReading, DeviceError> {
+            self.arm.read(timeout)
+        }
+
+        fn execute(
+            &mut self,
+            trajectory: &Trajectory,
+            limits: &MotionLimits,
+        ) -> Result<Execution, DeviceError> {
+            self.motions += 1;
+            if self.motions != self.at {
+                return self.arm.execute(trajectory, limits);
+            }
+            let half = trajectory.waypoints.len().div_ceil(2);
+            let first = Trajectory { waypoints: trajectory.waypoints[..half].to_vec() };
+            self.arm.execute(&first, limits)?;
+            Ok(Execution::Contact { link: "hand".into(), force: 20.0 })
+        }
+
+        fn grip(
+            &mut self,
+            command: GripCommand,
+            timeout: Duration,
+        ) -> Result<GripperReading, DeviceError> {
+            self.arm.grip(command, timeout)
+        }
+
+        fn gripper(&mut self, timeout: Duration) -> Result<GripperReading, DeviceError> {
+            self.arm.gripper(timeout)
+        }
+    }
+
+    #[test]
+    fn a_way_that_is_blocked_once_is_gone_back_and_the_cup_grasped() {
+        // Transfer, correction, approach.
+        for at in [1, 3] {
+            let mut robot = Opened::embedded(3, Scenario::Reach).unwrap();
+            robot.attach_arm("cup", false).unwrap();
+            let arm = robot.system.robot.arm.take().unwrap();
+            robot.system.robot.arm = Some(Box::new(Stopped { arm, motions: 0, at }));
+            let report =
+                vergence::grasp(&mut robot.system, "cup", &GraspConfig::default(), &mut ());
+            let grasp = report.grasp.unwrap();
+            assert!(grasp.succeeded, "{grasp:?}");
+            assert!(grasp.first_failure.as_ref().unwrap().contains("hand touched"), "{grasp:?}");
+            let physics = robot.physics().unwrap();
+            assert!(physics.lifted && physics.collision.is_none(), "{physics:?}");
+        }
+    }
+}

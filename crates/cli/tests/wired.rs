@@ -4,7 +4,7 @@
 // Helpers outside of test functions fail a test by panicking, too.
 #![allow(clippy::unwrap_used)]
 
-use std::io::{Read, Write};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::path::PathBuf;
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -217,18 +217,15 @@ fn the_command_offers_its_devices_until_it_is_told_to_end() {
     std::fs::create_dir_all(&folder).unwrap();
     let config = folder.join("wired.toml");
     let mut sim = Command::new(env!("CARGO_BIN_EXE_vergence"))
-        .args(["sim", "--json", "--seconds", "60", "--write-config"])
+        .args(["sim", "--json", "--seconds", "60", "--hold", "--write-config"])
         .arg(&config)
+        .stdin(Stdio::piped())
         .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
         .spawn()
         .unwrap();
-    let mut out = sim.stdout.take().unwrap();
-    let mut line = Vec::new();
-    let mut byte = [0];
-    while out.read(&mut byte).unwrap() == 1 && byte != *b"\n" {
-        line.push(byte[0]);
-    }
-    let told: Value = serde_json::from_slice(&line).unwrap();
+    let mut lines = BufReader::new(sim.stdout.take().unwrap()).lines();
+    let told: Value = serde_json::from_str(&lines.next().unwrap().unwrap()).unwrap();
     assert!(told["servos"].as_str().unwrap().starts_with("/dev/"), "{told}");
     assert_eq!(told["cameras"].as_array().unwrap().len(), 2);
     assert_eq!(told["truth"].as_array().unwrap().len(), 3);
@@ -239,6 +236,17 @@ fn the_command_offers_its_devices_until_it_is_told_to_end() {
         .unwrap();
     let tags: Value = serde_json::from_slice(&tags.stdout).unwrap();
     assert_eq!(tags["tags"].as_array().unwrap().len(), 3, "{tags}");
+    let mut stdin = sim.stdin.take().unwrap();
+    let mut answers = BufReader::new(sim.stderr.take().unwrap()).lines();
+    for (typed, answer) in [
+        ("cup 0.8 0.1 0.3", "cup is held"),
+        ("jug 0.8 0.1 0.3", "there is no object \"jug\""),
+        ("cup 0.8", "type OBJECT X Y Z"),
+    ] {
+        writeln!(stdin, "{typed}").unwrap();
+        let said = answers.next().unwrap().unwrap();
+        assert!(said.starts_with(answer), "{said}");
+    }
     assert!(Command::new("kill").arg(sim.id().to_string()).status().unwrap().success());
     assert_eq!(sim.wait().unwrap().code(), Some(0), "ends in order at SIGTERM");
     std::fs::remove_dir_all(&folder).unwrap();

@@ -84,7 +84,7 @@ impl<'a> Reaim<'a> {
     }
 
     /// The next angles of both heads; `None` when the light is known well enough.
-    pub fn next(&mut self) -> Result<Option<[[f64; 2]; 2]>, TriangulateError> {
+    pub fn next_aim(&mut self) -> Result<Option<[[f64; 2]; 2]>, TriangulateError> {
         let full = self.aims > 0 && self.aims.is_multiple_of(BATCH);
         if self.aims >= self.config.most || full && self.enough()? {
             return Ok(None);
@@ -93,7 +93,7 @@ impl<'a> Reaim<'a> {
         Ok(Some([0, 1].map(|k| self.aim(k, self.aims))))
     }
 
-    /// Adds what a head saw at the angles that [`Self::next`] gave; a head that saw nothing adds nothing.
+    /// Adds what a head saw at the angles that [`Self::next_aim`] gave; a head that saw nothing adds nothing.
     pub fn add(&mut self, head: usize, fixation: Fixation) {
         self.seen[head].push(fixation);
     }

@@ -2,7 +2,7 @@
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
+use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
 use clap::Args;
@@ -19,8 +19,7 @@ use crate::robot::RobotArgs;
 
 /// Offer the simulated workcell's devices over the wires of real ones: servos on a pseudo-terminal,
 /// cameras as MJPEG over HTTP, tags behind Bluetooth controllers on TCP. Runs in real time until
-/// it is interrupted. A line "OBJECT X Y Z" on standard input holds that object's light there (m, base),
-/// shining towards the heads: for `vergence calibrate` over the wires.
+/// it is interrupted.
 #[derive(Args)]
 pub struct Sim {
     #[command(flatten)]
@@ -31,6 +30,10 @@ pub struct Sim {
     /// End after so many seconds.
     #[arg(long, value_name = "SECONDS")]
     seconds: Option<f64>,
+    /// Read lines "OBJECT X Y Z" from standard input and hold that object's light there (m, base), shining
+    /// towards the heads: for `vergence calibrate` over the wires.
+    #[arg(long)]
+    hold: bool,
     /// Print where the devices are as one line of JSON.
     #[arg(long)]
     json: bool,
@@ -63,15 +66,11 @@ pub fn run(args: &Sim) -> Result<bool, Failure> {
         write_config(&wired, path, &urdf)?;
     }
     print(args, &wired)?;
-    let lines = typed();
+    let lines = args.hold.then(typed);
     let start = Instant::now();
     while !interrupt.raised() && lasting.is_none_or(|lasting| start.elapsed() < lasting) {
-        match lines.recv_timeout(POLL) {
-            Ok(line) => hold(&wired, &line),
-            Err(RecvTimeoutError::Timeout) => {}
-            // Nobody types: the devices stay.
-            Err(RecvTimeoutError::Disconnected) => std::thread::sleep(POLL),
-        }
+        std::thread::sleep(POLL);
+        lines.iter().flat_map(Receiver::try_iter).for_each(|line| hold(&wired, &line));
     }
     Ok(true)
 }

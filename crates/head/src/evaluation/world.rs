@@ -207,7 +207,7 @@ impl World {
         let below = reaim.run_up([self.kind.backlash; 2]);
         (0..2).for_each(|k| servos[k].go(below[k], &self.kind, random));
         // A light that got no distance has none with more aims either.
-        while let Ok(Some(goals)) = reaim.next() {
+        while let Ok(Some(goals)) = reaim.next_aim() {
             for k in 0..2 {
                 servos[k].go(goals[k], &self.kind, random);
                 if let Some(fixation) = self.sight(k, light, &servos[k], random) {

@@ -54,7 +54,7 @@ impl Run<'_> {
         };
         self.command(tag, LedCommand::Play(flicker))?;
         let mut readings = self.system.turn(reaim.run_up(slack).map(Some))?;
-        while let Some(goals) = reaim.next()? {
+        while let Some(goals) = reaim.next_aim()? {
             readings = self.system.turn(goals.map(Some))?;
             for (side, fixation) in self.look_once(&first, &readings)?.into_iter().enumerate() {
                 fixation.into_iter().for_each(|seen| reaim.add(side, seen));
