@@ -13,9 +13,10 @@ use nalgebra::{Point3, Vector3};
 use vergence::Hand;
 use vergence::report::PhysicsReport;
 use vergence_devices::{
-    Arm, ArmReading, Description, DeviceError, Execution, GripCommand, GripperReading, MotionLimits,
+    Arm, ArmReading, Config as Wiring, Description, DescriptionError, DeviceError, Execution,
+    GripCommand, GripperReading, MotionLimits,
 };
-use vergence_geometry::{Body, Camera, Trajectory, Transform};
+use vergence_geometry::{Body, Camera, Chain, Trajectory, Transform};
 use vergence_grasp::{Config, Obstacle, gripper, object};
 use vergence_imaging::canvas::{Canvas, colour};
 use vergence_imaging::{Image, codec};
@@ -38,7 +39,7 @@ const LIFTED_MM: f64 = 80.0;
 pub struct Bench {
     world: SharedWorld,
     start: Transform,
-    /// Commands to the gripper: the first opens, the second closes.
+    /// 1 when the fingers have opened, 2 when they have closed.
     grips: usize,
     collision: Option<Touch>,
     closing_error_mm: Option<f64>,
@@ -113,6 +114,8 @@ pub struct SimArm {
     workcell: Arc<Workcell>,
     object: String,
     links: Vec<Link>,
+    /// Id of the tag on the gripper and the chain to it.
+    tag: Option<(String, Chain)>,
 }
 
 /// A part of the arm and how bright it is.
@@ -182,8 +185,11 @@ pub fn build(
     }));
     let links = links(description, &cell);
     let arm = PhysicsArm::new(world, Some(Arc::from(workcell.clock())));
+    let tag = workcell.config().arm.as_ref().and_then(|arm| arm.tag.as_ref());
+    let tag = tag.map(|tag| Ok((tag.object_id.clone(), description.chain("base", &tag.link)?)));
+    let tag = tag.transpose().map_err(|e: DescriptionError| unusable(&e))?;
     let (workcell, object) = (workcell.clone(), object.into());
-    let arm = SimArm { arm, bench: bench.clone(), workcell, object, links };
+    let arm = SimArm { arm, bench: bench.clone(), workcell, object, links, tag };
     arm.show();
     arm.photograph();
     Ok(Some((arm, bench)))
@@ -232,7 +238,11 @@ impl SimArm {
         let world = self.arm.world();
         let frames = world.arm().chain().frames(world.joints());
         let open = 0.5 * world.jaws().opening();
+        let tag = self.tag.as_ref().map(|(id, chain)| (id, chain.forward(world.joints())));
         drop(world);
+        if let Some((id, base_from_tag)) = tag {
+            self.workcell.place_object(id, &base_from_tag);
+        }
         let parts: Vec<ArmPart> = self
             .links
             .iter()
@@ -290,14 +300,15 @@ impl Arm for SimArm {
     ) -> Result<GripperReading, DeviceError> {
         let mut bench = lock(&self.bench);
         bench.note_contacts();
-        bench.grips += 1;
+        // A grasp that is tried again opens the fingers more than once before it closes them.
+        let closing = bench.grips == 1 && command.width == 0.0;
+        bench.grips = if closing { 2 } else { bench.grips.max(1) };
         bench.motions.push(Motion::Grip(command));
-        let closing = bench.grips == 2;
         let before = bench.pose();
         drop(bench);
         let outcome = self.arm.grip(command, timeout);
         let mut bench = lock(&self.bench);
-        if bench.grips == 2 {
+        if closing {
             let shift = bench.pose().translation.vector - before.translation.vector;
             bench.closing_error_mm = Some(1e3 * shift.xy().norm());
         }
@@ -315,11 +326,82 @@ impl Arm for SimArm {
 }
 
 /// What the robot knows of its arm.
-pub fn hand(description: &Description) -> Result<Hand, Failure> {
-    Hand::read(description).map_err(|error| {
+pub fn hand(config: &Wiring, description: &Description) -> Result<Hand, Failure> {
+    Hand::read(config, description).map_err(|error| {
         Failure::misuse(
             error,
             "compare with the workcell that is built in: `vergence workcell DIR`",
         )
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use vergence::GraspConfig;
+    use vergence_sim::Scenario;
+
+    use super::*;
+    use crate::robot::Opened;
+
+    /// An arm that stops half way of one motion, as if it had touched something.
+    struct Stopped {
+        arm: Box<dyn Arm>,
+        motions: usize,
+        at: usize,
+    }
+
+    impl Arm for Stopped {
+        fn joint_names(&self) -> [String; 6] {
+            self.arm.joint_names()
+        }
+
+        fn read(&mut self, timeout: Duration) -> Result<ArmReading, DeviceError> {
+            self.arm.read(timeout)
+        }
+
+        fn execute(
+            &mut self,
+            trajectory: &Trajectory,
+            limits: &MotionLimits,
+        ) -> Result<Execution, DeviceError> {
+            self.motions += 1;
+            if self.motions != self.at {
+                return self.arm.execute(trajectory, limits);
+            }
+            let half = trajectory.waypoints.len().div_ceil(2);
+            let first = Trajectory { waypoints: trajectory.waypoints[..half].to_vec() };
+            self.arm.execute(&first, limits)?;
+            Ok(Execution::Contact { link: "hand".into(), force: 20.0 })
+        }
+
+        fn grip(
+            &mut self,
+            command: GripCommand,
+            timeout: Duration,
+        ) -> Result<GripperReading, DeviceError> {
+            self.arm.grip(command, timeout)
+        }
+
+        fn gripper(&mut self, timeout: Duration) -> Result<GripperReading, DeviceError> {
+            self.arm.gripper(timeout)
+        }
+    }
+
+    #[test]
+    fn a_way_that_is_blocked_once_is_gone_back_and_the_cup_grasped() {
+        // Transfer, correction, approach.
+        for at in [1, 3] {
+            let mut robot = Opened::embedded(3, Scenario::Reach).unwrap();
+            robot.attach_arm("cup", false).unwrap();
+            let arm = robot.system.robot.arm.take().unwrap();
+            robot.system.robot.arm = Some(Box::new(Stopped { arm, motions: 0, at }));
+            let report =
+                vergence::grasp(&mut robot.system, "cup", &GraspConfig::default(), &mut ());
+            let grasp = report.grasp.unwrap();
+            assert!(grasp.succeeded, "{grasp:?}");
+            assert!(grasp.first_failure.as_ref().unwrap().contains("hand touched"), "{grasp:?}");
+            let physics = robot.physics().unwrap();
+            assert!(physics.lifted && physics.collision.is_none(), "{physics:?}");
+        }
+    }
 }

@@ -187,16 +187,22 @@ impl Playback {
     }
 }
 
+/// How long a recorded picture waits for its reader.
+const KEPT: Duration = Duration::from_millis(100);
+
 impl Camera for Playback {
     fn next_frame(&mut self, timeout: Duration) -> Result<Frame, DeviceError> {
-        let frame = match self.waiting.take() {
-            Some(frame) => frame,
+        let frame = loop {
+            if let Some(frame) = self.waiting.take() {
+                break frame;
+            }
             // The recording has its own time; how long we wait is decided below.
-            None => {
-                let mut frame = self.camera.next_frame(Duration::MAX)?;
-                let first = *self.first.get_or_insert(frame.stamp);
-                frame.stamp = self.start + frame.stamp.saturating_sub(first);
-                frame
+            let mut frame = self.camera.next_frame(Duration::MAX)?;
+            let first = *self.first.get_or_insert(frame.stamp);
+            frame.stamp = self.start + frame.stamp.saturating_sub(first);
+            // A camera that nobody read meanwhile does not keep its pictures either.
+            if frame.stamp + KEPT >= self.clock.now() {
+                break frame;
             }
         };
         let wait = (frame.stamp + frame.exposure).saturating_sub(self.clock.now());

@@ -3,12 +3,11 @@
 use std::io::{BufRead, Write};
 use std::sync::Arc;
 
-use nalgebra::{Point3, Translation3, UnitQuaternion, Vector3};
+use nalgebra::{Point3, Vector3};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use vergence::{LightMover, Placed};
 use vergence_devices::DeviceError;
-use vergence_geometry::Transform;
 use vergence_sim::Workcell;
 
 /// What is known of the light's places beside what the heads see.
@@ -83,7 +82,7 @@ impl LightMover for Person {
 }
 
 /// Three numbers, separated by spaces or commas.
-fn coordinates(text: &str) -> Option<Point3<f64>> {
+pub fn coordinates(text: &str) -> Option<Point3<f64>> {
     let mut numbers = text.split([' ', ',']).map(str::trim).filter(|part| !part.is_empty());
     let mut next = || numbers.next()?.parse::<f64>().ok().filter(|x| x.is_finite());
     let point = Point3::new(next()?, next()?, next()?);
@@ -150,23 +149,12 @@ impl LightMover for SimulatedPerson {
         };
         let shake = Vector3::from_fn(|_, _| self.normal());
         let known = self.ruler.measured.map(|sigma| Point3::from(self.light + shake * sigma));
-        let missing = || DeviceError::Unsupported {
-            device: "simulated person".into(),
-            what: format!("there is no object \"{}\" with a light to hold", self.object),
-        };
-        let truth = self.workcell.truth();
-        let object = truth.objects.iter().find(|o| o.id == self.object).ok_or_else(missing)?;
-        let site = object.record.landmarks.first().ok_or_else(missing)?;
-        // Upright, the light's normal turned towards the foot of the mast.
-        let facing = (-self.light.y).atan2(-self.light.x);
-        let normal = Vector3::from(site.normal);
-        let yaw = facing - normal.y.atan2(normal.x);
-        let turned = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw);
-        let centre = self.light - turned * Vector3::from(site.position);
-        let place = Transform::from_parts(Translation3::from(centre), turned);
-        match self.workcell.place_object(&self.object, &place) {
+        match self.workcell.hold_light(&self.object, &Point3::from(self.light)) {
             true => Ok(Some(self.ruler.placed(number, known))),
-            false => Err(missing()),
+            false => Err(DeviceError::Unsupported {
+                device: "simulated person".into(),
+                what: format!("there is no object \"{}\" with a light to hold", self.object),
+            }),
         }
     }
 }

@@ -46,7 +46,7 @@ fn hci(radio: &RadioConfig) -> Result<HciLink, Failure> {
     let config = LinkConfig::default();
     let link = match (&radio.tcp, &radio.device, radio.linux) {
         (Some(address), None, None) => HciLink::tcp(address, config),
-        (None, Some(path), None) => HciLink::device(&path.to_string_lossy(), config),
+        (None, Some(path), None) => HciLink::serial(path, radio.baud, config),
         (None, None, Some(controller)) => HciLink::linux(controller, config),
         _ => {
             return Err(Failure::misuse(

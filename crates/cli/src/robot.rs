@@ -168,7 +168,7 @@ impl Opened {
         let built = bench::build(workcell, &self.description, object, photographs)?;
         if let Some((arm, bench)) = built {
             self.system.robot.arm = Some(Box::new(arm));
-            self.system.hand = Some(bench::hand(&self.description)?);
+            self.system.hand = Some(bench::hand(&self.config, &self.description)?);
             self.bench = Some(bench);
         }
         Ok(())

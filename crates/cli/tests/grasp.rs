@@ -80,6 +80,25 @@ fn a_cup_is_found_grasped_and_lifted() {
     assert_eq!(replay["motions"].as_array().unwrap().len(), 6);
 }
 
+/// Heads whose joints are off by a few degrees' tenths put object and hand alike beside where they are.
+#[test]
+fn a_light_on_the_gripper_tells_how_far_the_heads_are_off() {
+    let path = workcell("hand-light", |cup| cup.into());
+    let text = std::fs::read_to_string(&path).unwrap();
+    let text = text.replace("# tag = {", "tag = {");
+    std::fs::write(&path, text.replace("joint_zero_deg = 0.0", "joint_zero_deg = 0.2")).unwrap();
+    let (_, report) = grasp(&path, &["--seed", "1"]);
+    let grasp = &report["grasp"];
+    let off = grasp["hand_off_mm"].as_f64().unwrap_or_else(|| panic!("{grasp}"));
+    let truth = [0, 1, 2].map(|k| report["truth"]["landmark"][k].as_f64().unwrap());
+    let told = [0, 1, 2].map(|k| report["landmark"]["position"][k].as_f64().unwrap());
+    let wrong = 1e3 * truth.iter().zip(told).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
+    assert!(
+        wrong > 5.0 && (off - wrong).abs() < 4.0,
+        "off by {wrong:.1} mm, told {off:.1}: {grasp}"
+    );
+}
+
 #[test]
 fn what_must_not_or_cannot_be_lifted_is_refused_by_name() {
     let fixed = workcell("fixed", |cup| cup.replacen("\"movable\"", "\"fixed\"", 1));

@@ -14,7 +14,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let [url, width, height, count] = arguments.as_slice() else {
         return Err("mjpeg_probe URL WIDTH HEIGHT COUNT".into());
     };
-    let config = MjpegConfig { url: url.clone(), exposure: 0.0 };
+    let config = MjpegConfig { url: url.clone(), exposure: 0.0, latency: 0.05 };
     let size = (width.parse()?, height.parse()?);
     let mut camera = MjpegCamera::open(&config, size, Arc::new(SystemClock::start()))?;
     for _ in 0..count.parse::<usize>()? {

@@ -71,7 +71,7 @@ pub struct Config {
     /// The arm; without it the robot finds but does not grasp. The URDF's links `hand` and `tcp`
     /// are its gripper and the point midway between the fingertips.
     #[serde(default)]
-    pub arm: Option<DriverConfig>,
+    pub arm: Option<ArmConfig>,
     /// The simulated workcell's own table, read by the simulator.
     #[serde(default)]
     pub sim: Option<toml::Table>,
@@ -149,12 +149,25 @@ pub struct ServosConfig {
     pub dynamixel: Option<DynamixelConfig>,
 }
 
-/// A device that needs no more than a driver's name.
+/// The arm.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct DriverConfig {
+pub struct ArmConfig {
     /// Driver name.
     pub driver: String,
+    /// A tag on the gripper, whose light tells the heads where the hand is beside the object.
+    #[serde(default)]
+    pub tag: Option<HandTag>,
+}
+
+/// A tag on the gripper. Its record tells where its lights are.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct HandTag {
+    /// Object id that it advertises.
+    pub object_id: String,
+    /// The URDF's link that is the frame of its record.
+    pub link: String,
 }
 
 /// The tag radio's driver. The driver `hci` needs to know where its controller is: `tcp`, `device` or
@@ -167,9 +180,13 @@ pub struct RadioConfig {
     /// Host and port of a Bluetooth controller that speaks H4 over TCP.
     #[serde(default)]
     pub tcp: Option<String>,
-    /// Serial line of a Bluetooth controller, its speed and raw mode set.
+    /// Serial line of a Bluetooth controller.
     #[serde(default)]
     pub device: Option<PathBuf>,
+    /// Speed of that line (baud). The one of Zephyr's `hci_uart`, which most boards run, when left out;
+    /// a line over USB knows none.
+    #[serde(default = "default_baud")]
+    pub baud: u32,
     /// Number of a Bluetooth controller of this computer (0 is `hci0`), taken from the kernel's own
     /// host ("user channel"): it must be off, bluetoothd stopped; needs CAP_NET_ADMIN.
     #[serde(default)]
@@ -188,6 +205,10 @@ pub struct RadioConfig {
     /// Refuse to find objects whose records are not signed by one of them.
     #[serde(default)]
     pub require_signature: bool,
+}
+
+fn default_baud() -> u32 {
+    1_000_000
 }
 
 impl Config {

@@ -5,12 +5,13 @@
 //! hand and object alike and cancels. After the lift the landmark must have moved as the hand has.
 
 use nalgebra::{Matrix3, Point3, Vector3};
-use vergence_geometry::{GaussianPoint, GaussianPose, Transform};
+use vergence_geometry::{GaussianPoint, GaussianPose, JointAngles, Trajectory, Transform};
 
 use crate::margin::{ELLIPSOID_95, margin};
 use crate::motion::{self, NoMotion, Scene};
 use crate::plan::{Plan, Refusal};
 use crate::planner::{self, Allowed, Config, Request, Robot};
+use crate::timing;
 
 /// Plans the rest of a grasp anew after a second look: same grasp, object where it is seen now.
 ///
@@ -57,6 +58,33 @@ pub fn correct(
         plan.alternatives.clone(),
         plan.rejected,
     ))
+}
+
+/// Turns the lifted object by an angle (rad) about the vertical, so that what the hand hides from the
+/// heads is seen: the motion from where the lift ends. `request` is the one that the plan was made for;
+/// `None` when the arm cannot, or something is in the way.
+pub fn turn_in_sight(
+    robot: &Robot,
+    plan: &Plan,
+    request: &Request,
+    config: &Config,
+    from: &JointAngles,
+    angle: f64,
+) -> Option<Trajectory> {
+    let scene = Scene::new(request, &config.assumptions);
+    let path = motion::turn(robot, config, &scene, &plan.grasp, from, angle).ok()?;
+    Some(timing::parameterise(&robot.arm, &path, &config.speeds))
+}
+
+/// The same plan with its next best grasp, to be made anew by [`correct`]; `None` when there is no other.
+pub fn next_best(plan: &Plan, object: &GaussianPose) -> Option<Plan> {
+    let ((grasp, _), others) = plan.alternatives.split_first()?;
+    Some(Plan {
+        base_from_tip: object.pose * grasp.object_from_tip,
+        grasp: grasp.clone(),
+        alternatives: others.to_vec(),
+        ..plan.clone()
+    })
 }
 
 /// Places the object relative to the hand.

@@ -24,7 +24,7 @@ mod planner;
 pub mod timing;
 
 pub use candidates::{Grasp, Hold};
-pub use closing::{LiftVerdict, correct, relative_to_hand, verify_lift};
+pub use closing::{LiftVerdict, correct, next_best, relative_to_hand, turn_in_sight, verify_lift};
 pub use collision::{Clearances, Hit, Obstacle};
 pub use kinematics::Arm;
 pub use plan::{Plan, Refusal, Rejected};

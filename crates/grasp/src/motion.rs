@@ -4,7 +4,7 @@
 //! way. The grasp posture is found first (closed form, both exchanges of the fingers), then the
 //! straight line back to the pre-grasp and the straight line up, then the way from the start.
 
-use nalgebra::Vector3;
+use nalgebra::{UnitQuaternion, Vector3};
 use vergence_geometry::{JointAngles, Trajectory, Transform};
 
 use crate::candidates::{Assumptions, Grasp};
@@ -17,6 +17,8 @@ use crate::timing::{self, Speeds};
 
 /// Length of a step of a straight line (m).
 const LINE_STEP: f64 = 0.005;
+/// A step of a turn (rad): 8 mm at a cup's far side.
+const TURN_STEP: f64 = 0.1;
 /// Largest change of a joint over such a step (rad): more is a change of branch or a singularity.
 const LARGEST_JUMP: f64 = 0.25;
 /// Distance at which the object counts as standing on something (m).
@@ -168,6 +170,32 @@ fn carry_out(
     Ok(Motion { transfer, approach, lift })
 }
 
+/// The hand turned by an angle (rad) about the vertical through its tip, the object in it, from a posture.
+pub(crate) fn turn(
+    robot: &Robot,
+    config: &Config,
+    scene: &Scene,
+    grasp: &Grasp,
+    from: &JointAngles,
+    angle: f64,
+) -> Result<Vec<JointAngles>, NoMotion> {
+    let base_from_tip = robot.arm.forward(from);
+    let steps = (angle.abs() / TURN_STEP).ceil().max(1.0) as usize;
+    let path = follow(&robot.arm, from, steps, |part| {
+        let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), part * angle);
+        let rotation = turn * base_from_tip.rotation;
+        Transform::from_parts(base_from_tip.translation, rotation)
+    })?;
+    let (hand, load) = scene.after(grasp);
+    for around in [hand, load] {
+        for q in &path {
+            let free = robot.shape.check(&robot.arm, q, grasp.width, &around, &config.near);
+            free.map_err(NoMotion::Blocked)?;
+        }
+    }
+    Ok(path)
+}
+
 /// The way from the start to the pre-grasp.
 fn transfer(
     robot: &Robot,
@@ -199,11 +227,24 @@ fn straight(
     shift: &Vector3<f64>,
 ) -> Result<Vec<JointAngles>, NoMotion> {
     let steps = (shift.norm() / LINE_STEP).ceil().max(1.0) as usize;
+    follow(arm, from, steps, |part| {
+        let mut tip = *base_from_tip;
+        tip.translation.vector += shift * part;
+        tip
+    })
+}
+
+/// Postures at which the tip is where `tip` has it, for parts from 0 to 1 of the way.
+fn follow(
+    arm: &Arm,
+    from: &JointAngles,
+    steps: usize,
+    tip: impl Fn(f64) -> Transform,
+) -> Result<Vec<JointAngles>, NoMotion> {
     let mut path = vec![*from];
     let mut last = *from;
     for n in 1..=steps {
-        let mut tip = *base_from_tip;
-        tip.translation.vector += shift * (n as f64 / steps as f64);
+        let tip = tip(n as f64 / steps as f64);
         let next = arm.solutions(&tip, &last).into_iter().next().ok_or(NoMotion::Unreachable)?;
         if distance(&next, &last) > LARGEST_JUMP {
             return Err(NoMotion::Unreachable);

@@ -8,7 +8,9 @@ use std::path::Path;
 use nalgebra::{Matrix6, Translation3, UnitQuaternion, Vector3, Vector6};
 use vergence_devices::Description;
 use vergence_geometry::{Body, GaussianPose, JointAngles, Solid, Trajectory, Transform};
-use vergence_grasp::{Config, Hold, Obstacle, Plan, Refusal, Request, Robot, correct, plan};
+use vergence_grasp::{
+    Config, Hold, Obstacle, Plan, Refusal, Request, Robot, correct, next_best, plan, turn_in_sight,
+};
 use vergence_tag::Record;
 
 const HOME: JointAngles = [-0.9, -0.6, 1.3, 0.0, 0.9, 0.0];
@@ -256,4 +258,61 @@ fn a_second_look_corrects_the_rest_of_the_plan_or_voids_it() {
     let closed = robot.arm.forward(&end(&corrected.approach)).translation.vector;
     assert!((closed - wanted.translation.vector).norm() < 1e-6);
     assert!(matches!(look(0.66).0, Err(Refusal::Moved { .. })));
+}
+
+#[test]
+fn a_lifted_object_is_turned_in_place_unless_something_stands_there() {
+    let (record, robot, config) = (cup(), robot(), Config::default());
+    let object = standing(&record, 0.6, 0.0, 0.0, 1.0);
+    let made = ask(&record, &object, &[table()]).unwrap();
+    let lifted = end(&made.lift);
+    let turn = |obstacles: &[Obstacle], angle: f64| {
+        let request = Request {
+            record: &record,
+            object: &object,
+            landmark: 0,
+            start: &lifted,
+            obstacles,
+            free_azimuths: &[],
+            seed: 1,
+        };
+        turn_in_sight(&robot, &made, &request, &config, &lifted, angle)
+    };
+    let before = robot.arm.forward(&lifted);
+    let turned = [0.8, -0.8].map(|angle| (angle, turn(&[table()], angle)));
+    assert!(turned.iter().any(|(_, turn)| turn.is_some()), "the wrist turns neither way");
+    for (angle, turn) in turned {
+        let Some(turn) = turn else { continue };
+        assert_eq!(turn.waypoints[0].positions, lifted);
+        let after = robot.arm.forward(&end(&turn));
+        assert!((after.translation.vector - before.translation.vector).norm() < 1e-6);
+        let by = (after.rotation * before.rotation.inverse()).scaled_axis();
+        assert!((by - Vector3::z() * angle).norm() < 1e-6, "{by} instead of {angle}");
+    }
+    // A wall where the cup is now.
+    let at = object.pose.translation.vector + Vector3::new(0.0, 0.0, config.lift);
+    let wall = block("wall", at.into(), [0.01, 0.01, 0.05]);
+    assert!([0.8, -0.8].iter().all(|angle| turn(&[table(), wall.clone()], *angle).is_none()));
+}
+
+#[test]
+fn the_next_best_grasp_is_another_that_can_be_carried_out() {
+    let (record, robot, config) = (carton(), robot(), Config::default());
+    let object = standing(&record, 0.6, 0.1, 0.7, 1.0);
+    let made = ask(&record, &object, &[table()]).unwrap();
+    let next = next_best(&made, &object).unwrap();
+    assert_ne!(next.grasp, made.grasp);
+    let request = Request {
+        record: &record,
+        object: &object,
+        landmark: 0,
+        start: &HOME,
+        obstacles: &[table()],
+        free_azimuths: &[],
+        seed: 1,
+    };
+    let again = correct(&robot, &next, &request, &config).unwrap();
+    let closed = robot.arm.forward(&end(&again.approach)).translation.vector;
+    let wanted = object.pose * next.grasp.object_from_tip;
+    assert!((closed - wanted.translation.vector).norm() < 1e-6);
 }

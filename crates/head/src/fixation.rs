@@ -107,21 +107,6 @@ pub fn run_up(
     Some(head.clamp(via))
 }
 
-/// `count` pairs of angles around `centre`, within `reach` (rad) of it and evenly spread, for
-/// averaging over the encoder's steps: fixations at these differ in their rounding. A reach of a few
-/// steps is enough. Ordered upwards in pan, so that pan arrives from one side by itself.
-pub fn dither(centre: [f64; 2], reach: f64, count: usize) -> Vec<[f64; 2]> {
-    // The golden ratio's multiples spread evenly for every count.
-    const GOLDEN: f64 = 0.618_033_988_749_894_9;
-    (0..count)
-        .map(|i| {
-            let along = (i as f64 + 0.5) / count as f64;
-            let across = ((i as f64 + 0.5) * GOLDEN).fract();
-            [centre[0] + reach * (2.0 * along - 1.0), centre[1] + reach * (2.0 * across - 1.0)]
-        })
-        .collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -189,17 +174,5 @@ mod tests {
         let pixel = head.project(angles, &point).unwrap();
         let mut fixator = Fixator::new(FixatorConfig::default());
         assert_eq!(fixator.next(&head, angles, &pixel, None), NextMove::Hold);
-    }
-
-    #[test]
-    fn dithered_angles_stay_within_reach_and_rise() {
-        let angles = dither([0.2, -0.1], 0.01, 16);
-        assert_eq!(angles.len(), 16);
-        for pair in angles.windows(2) {
-            assert!(pair[1][0] > pair[0][0]);
-        }
-        let mean = angles.iter().map(|a| a[1]).sum::<f64>() / 16.0;
-        assert!((mean + 0.1).abs() < 1e-3, "{mean}");
-        assert!(angles.iter().all(|a| (a[0] - 0.2).abs() < 0.01 && (a[1] + 0.1).abs() < 0.01));
     }
 }

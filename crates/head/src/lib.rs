@@ -8,6 +8,7 @@
 //! Search  -> where to look next until both heads see the light
 //! Fixator -> from the residual pixel to the next angles, until the light is centred
 //! triangulate / paper_distance -> where the light is
+//! Reaim -> where to look again until its distance is known well enough
 //! calibrate -> the head as it is, from the head as it is described
 //! ```
 //!
@@ -23,13 +24,15 @@ pub mod evaluation;
 mod fixation;
 mod kinematics;
 mod paper;
+mod reaim;
 mod search;
 mod triangulation;
 
 pub use calibration::{Calibration, CalibrationConfig, calibrate};
-pub use fixation::{Fixator, FixatorConfig, NextMove, dither, run_up};
+pub use fixation::{Fixator, FixatorConfig, NextMove, run_up};
 pub use kinematics::{HeadError, PanTiltHead};
 pub use paper::{PaperAngles, paper_distance};
+pub use reaim::{Reaim, ReaimConfig};
 pub use search::{Field, Search, SearchConfig};
 pub use triangulation::{
     Fixation, GATE_SIGMAS, Landmark, Noise, TriangulateError, epipolar_gap, triangulate,

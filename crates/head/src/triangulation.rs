@@ -14,7 +14,7 @@
 //!
 //! The covariance is the block of `p` in the inverse of the normal matrix, so `b` is marginalised.
 //! With one fixation a head this is the optimal intersection of two rays. More fixations at slightly
-//! different angles ([`crate::dither`]) narrow the encoder's steps down but not what they share: each
+//! different angles ([`crate::Reaim`]) narrow the encoder's steps down but not what they share: each
 //! head's are first made into one, which uses that rounding is bounded (module `bounded`).
 //!
 //! What it cannot do: tell a light from its image in a mirror that both heads see. Both rays then

@@ -1,6 +1,7 @@
 //! The robot's tag radio: a plain object on top, the Bluetooth host on a thread of its own below.
 
 use std::io;
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::mpsc::{self, RecvTimeoutError, Sender};
 use std::time::Duration;
@@ -60,15 +61,12 @@ impl HciLink {
         opened.map_err(|reason| not_opened(address, reason))
     }
 
-    /// A radio whose controller speaks H4 over a character device: a serial line whose speed and
-    /// raw mode are set (`stty`), or a pseudo-terminal.
-    pub fn device(path: &str, config: LinkConfig) -> Result<Self, DeviceError> {
+    /// A radio whose controller speaks H4 over a serial line at this speed (baud), with hardware flow
+    /// control, or over a pseudo-terminal.
+    pub fn serial(path: &Path, baud: u32, config: LinkConfig) -> Result<Self, DeviceError> {
         let target = path.to_owned();
-        let open = move || {
-            let file = std::fs::File::options().read(true).write(true).open(&target)?;
-            Ok(StreamTransport::new(file.try_clone()?, file))
-        };
-        Self::open(open, config).map_err(|reason| not_opened(path, reason))
+        let opened = Self::open(move || StreamTransport::serial(&target, baud), config);
+        opened.map_err(|reason| not_opened(&path.to_string_lossy(), reason))
     }
 
     /// A radio on a controller of this computer (0 is `hci0`), taken from the kernel's own host: it must

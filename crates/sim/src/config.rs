@@ -31,6 +31,8 @@ pub struct SimConfig {
     pub light: LightSettings,
     /// The radio.
     pub radio: RadioSettings,
+    /// What the tag on the gripper tells, when the arm's configuration names one.
+    pub gripper_record: Option<Record>,
     /// The tagged objects.
     pub objects: Vec<ObjectSettings>,
 }
@@ -176,6 +178,14 @@ pub struct ObjectSettings {
     pub yaw_deg: Option<f64>,
 }
 
+impl ObjectSettings {
+    /// Plain, placed by chance, with a tag that every robot may write.
+    pub fn of(record: Record) -> Self {
+        let (surface, handle, passkey) = (Surface::default(), false, None);
+        ObjectSettings { record, surface, handle, passkey, at: None, yaw_deg: None }
+    }
+}
+
 /// How a surface looks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -202,6 +212,7 @@ impl Default for SimConfig {
             led: LedSettings::default(),
             light: LightSettings::default(),
             radio: RadioSettings::default(),
+            gripper_record: None,
             objects: Vec::new(),
         }
     }
@@ -328,11 +339,12 @@ impl SimConfig {
                 return Err(SimError::Range { key, value, low, high });
             }
         }
-        for object in &self.objects {
-            object
-                .record
+        for record in self.objects.iter().map(|o| &o.record).chain(&self.gripper_record) {
+            record
                 .validate()
-                .map_err(|why| SimError::Record { id: object.record.object_id.to_string(), why })?;
+                .map_err(|why| SimError::Record { id: record.object_id.to_string(), why })?;
+        }
+        for object in &self.objects {
             let value = object.passkey.map_or(0.0, f64::from);
             if value > MAX_PASSKEY {
                 return Err(SimError::Range {
@@ -360,6 +372,7 @@ mod tests {
         let file: toml::Table = crate::EMBEDDED_CONFIG.parse().unwrap();
         let mut shown = SimConfig::from_table(file["sim"].as_table().unwrap()).unwrap();
         assert_eq!(shown.objects.len(), 3);
+        assert!(shown.gripper_record.take().is_some());
         shown.objects.clear();
         assert_eq!(shown, SimConfig::default());
     }

@@ -19,6 +19,7 @@ use std::sync::{Arc, MutexGuard};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use nalgebra::Point3;
 use vergence_devices::Side;
 use vergence_devices::dynamixel::model::MODELS;
 use vergence_devices::dynamixel::{Model, Shaft, Trouble, VirtualBus, VirtualServo};
@@ -110,6 +111,11 @@ impl WiredWorkcell {
     /// Where Bluetooth controllers in reach of the tags are had.
     pub fn tags(&self) -> SocketAddr {
         self.tags
+    }
+
+    /// Holds an object's light at a place (base, m), see [`Workcell::hold_light`].
+    pub fn hold_light(&self, id: &str, place: &Point3<f64>) -> bool {
+        self.workcell.hold_light(id, place)
     }
 
     /// What is really so, at this moment.

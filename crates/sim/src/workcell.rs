@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use nalgebra::{Matrix3, Point3, Rotation3, Unit, UnitQuaternion, Vector3};
 use rand::RngExt;
+use vergence_devices::config::HandTag;
 use vergence_devices::{Clock, Config, Description, Head, Robot, Side};
 use vergence_geometry::{Camera as Lens, Chain, Solid, Transform};
 use vergence_imaging::Image;
@@ -16,12 +17,12 @@ use vergence_link::HciLink;
 use vergence_tag::{Pattern, Record, pattern::Bits};
 
 use crate::camera::{Blinker, Capture, Sensor};
-use crate::config::{GeometryError, Scenario, SimConfig};
+use crate::config::{GeometryError, ObjectSettings, Scenario, SimConfig};
 use crate::devices::{SimCamera, SimClock, SimPanTilt};
 use crate::error::SimError;
 use crate::lights::Play;
 use crate::noise::{normal, stream};
-use crate::placement::{RestView, compose};
+use crate::placement::{RestView, TaggedObject, compose};
 use crate::radio::{self, Radio};
 use crate::scene::{Body, Material};
 use crate::servo::Servo;
@@ -79,9 +80,13 @@ impl Workcell {
 
     /// The embedded workcell in another scenario.
     pub fn embedded_as(scenario: Scenario, seed: u64) -> Result<Self, SimError> {
-        let (config, description) = embedded_files()?;
+        let (mut config, description) = embedded_files()?;
         let mut settings = settings(&config)?;
         settings.scenario = scenario;
+        if let (Scenario::Reach, Some(arm)) = (scenario, &mut config.arm) {
+            // An arm that grasps has a light on its gripper.
+            arm.tag = Some(HandTag { object_id: "gripper".into(), link: "gripper_tag".into() });
+        }
         Self::new(config, description, settings, seed)
     }
 
@@ -98,7 +103,7 @@ impl Workcell {
     pub fn new(
         config: Config,
         description: Description,
-        settings: SimConfig,
+        mut settings: SimConfig,
         seed: u64,
     ) -> Result<Self, SimError> {
         let mut heads = Vec::new();
@@ -115,7 +120,16 @@ impl Workcell {
         let [left, right]: [TrueHead; 2] =
             heads.try_into().map_err(|_| SimError::Table("two heads".into()))?;
         let views = [views[0], views[1]];
-        let composition = compose(&settings, &views, seed)?;
+        let mut composition = compose(&settings, &views, seed)?;
+        let on_table = composition.objects.len();
+        let tag = config.arm.as_ref().and_then(|arm| arm.tag.as_ref());
+        if let (Some(_), Some(record)) = (tag, settings.gripper_record.clone()) {
+            // Behind the heads until the arm is shown.
+            let base_from_object = Transform::translation(-0.5, 0.0, 0.5);
+            composition.objects.push(TaggedObject { record: record.clone(), base_from_object });
+            composition.bodies_of.push(0..0);
+            settings.objects.push(ObjectSettings::of(record));
+        }
         let radio = Radio::new(&settings, &composition.objects, seed)?;
         let status = composition.status.map(|emitter| {
             let half = Duration::from_secs_f64(0.5 / settings.light.status_hz);
@@ -137,6 +151,7 @@ impl Workcell {
         let world = World {
             heads: [left, right],
             objects: composition.objects,
+            on_table,
             bodies_of: composition.bodies_of,
             without_arm: composition.scene.bodies.len(),
             clutter: composition.clutter,
@@ -202,7 +217,7 @@ impl Workcell {
     /// What is really so, at this moment.
     pub fn truth(&self) -> Truth {
         let world = lock(&self.world);
-        let objects = world.objects.iter().map(|object| TrueObject {
+        let objects = world.objects.iter().take(world.on_table).map(|object| TrueObject {
             id: object.record.object_id.to_string(),
             record: object.record.clone(),
             base_from_object: object.base_from_object,
@@ -220,6 +235,19 @@ impl Workcell {
     /// `false` when there is no such object.
     pub fn place_object(&self, id: &str, base_from_object: &Transform) -> bool {
         lock(&self.world).place_object(id, base_from_object)
+    }
+
+    /// Holds a tagged object upright so that its first light is at a place (base, m) and shines towards
+    /// the foot of the heads' mast, as a person would who calibrates. `false` when there is no such light.
+    pub fn hold_light(&self, id: &str, place: &Point3<f64>) -> bool {
+        let world = &mut *lock(&self.world);
+        let record = world.objects.iter().map(|object| &object.record);
+        let held = record.into_iter().find(|record| record.object_id.as_str() == id);
+        let Some(site) = held.and_then(|record| record.landmarks.first()) else { return false };
+        let yaw = (-place.y).atan2(-place.x) - site.normal[1].atan2(site.normal[0]);
+        let turned = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw);
+        let centre = place.coords - turned * Vector3::from(site.position);
+        world.place_object(id, &Transform::from_parts(centre.into(), turned))
     }
 
     /// Shows the arm's parts where they are now, in place of where they were; the cameras see them

@@ -72,6 +72,8 @@ pub struct World {
     pub(crate) settings: SimConfig,
     pub(crate) heads: [TrueHead; 2],
     pub(crate) objects: Vec<TaggedObject>,
+    /// Number of objects on the table; the tag on the gripper comes after them.
+    pub(crate) on_table: usize,
     /// Which bodies of the scene belong to each object.
     pub(crate) bodies_of: Vec<Range<usize>>,
     /// Number of bodies of the scene that are not the arm's; those come last.

@@ -11,6 +11,7 @@ use std::time::Duration;
 
 use vergence_devices::{Advertisement, DeviceError, LedCommand, Side, TagAddress};
 use vergence_geometry::{GaussianPoint, Symmetry, Transform};
+use vergence_head::ReaimConfig;
 use vergence_imaging::Frame;
 use vergence_landmark::FinderError;
 use vergence_pose::{ObjectPose, Query, Refusal, View};
@@ -24,7 +25,7 @@ use crate::system::System;
 mod blink;
 mod centre;
 mod collect;
-mod reaim;
+pub(crate) mod reaim;
 pub(crate) mod search;
 
 pub use collect::{CollectConfig, CollectError, LightMover, Placed, Session, collect};
@@ -56,11 +57,9 @@ pub struct FindConfig {
     pub link_tries: usize,
     /// Searches that are started when a light turned out not to be the tag's.
     pub search_tries: usize,
-    /// Standard deviation of the landmark's distance that is good enough (m): aiming again ends there.
-    pub depth_sigma: f64,
-    /// Most times that the heads aim again to average over the encoders' steps; the paper's method
-    /// never does.
-    pub reaims: usize,
+    /// When the heads stop aiming again to see through the encoders' steps; the paper's method never
+    /// begins.
+    pub reaim: ReaimConfig,
     /// Seed for the choice of patterns.
     pub seed: u64,
 }
@@ -73,8 +72,7 @@ impl Default for FindConfig {
             link_timeout: Duration::from_secs(2),
             link_tries: 3,
             search_tries: 3,
-            depth_sigma: 0.002,
-            reaims: 16,
+            reaim: ReaimConfig::default(),
             seed: 0,
         }
     }
@@ -99,8 +97,8 @@ pub(crate) enum Stop {
     Lost(&'static str),
     #[error("the two heads do not see one and the same light: {0}")]
     Triangulation(#[from] vergence_head::TriangulateError),
-    #[error("the pictures were refused: {0}")]
-    Frames(#[from] FinderError),
+    #[error("the {0} camera's pictures were refused: {1}")]
+    Frames(&'static str, FinderError),
     #[error("{0}")]
     Refused(#[from] Refusal),
     #[error("{0}")]
@@ -146,7 +144,7 @@ impl Stop {
             Stop::Triangulation(_) => {
                 "look for mirrors near the object; if it happens everywhere, calibrate the heads"
             }
-            Stop::Frames(_) => "check the camera's format and its time stamps",
+            Stop::Frames(..) => "check the camera's format and its time stamps",
             Stop::Refused(_) => {
                 "free the view of the object, add light, or check the record's size and shape"
             }
@@ -224,6 +222,8 @@ pub(crate) struct Run<'a> {
     pub(crate) observer: &'a mut dyn Observer,
     timeline: Vec<Step>,
     pub(crate) landmark: Option<LandmarkReport>,
+    /// Who answered on the radio.
+    pub(crate) heard: Vec<Advertisement>,
     /// Time between two pictures, known when the tag blinks.
     interval: Duration,
 }
@@ -241,6 +241,7 @@ impl<'a> Run<'a> {
             observer,
             timeline: Vec::new(),
             landmark: None,
+            heard: Vec::new(),
             interval: Duration::ZERO,
         }
     }
@@ -251,7 +252,7 @@ impl Run<'_> {
     pub(crate) fn all(&mut self, object: &str) -> Result<Found, Stop> {
         let tag = self.step("radio", |run| run.radio(object))?;
         let record = self.step("record", |run| run.record(&tag))?;
-        let pattern = self.step("blink", |run| run.start_blinking(tag.address))?;
+        let pattern = self.step("blink", |run| run.start_blinking(tag.address, 0))?;
         let landmark = self.locate(tag.address, pattern);
         // The light must go out whether or not it was seen: for the pictures, and for the battery.
         let stopped = self.step("stop", |run| run.command(tag.address, LedCommand::Stop));
@@ -338,6 +339,7 @@ impl Run<'_> {
     fn radio(&mut self, object: &str) -> Result<Advertisement, Stop> {
         let heard = self.system.robot.radio.scan(self.config.scan_window)?;
         self.observer.notice(&Event::Heard(&heard));
+        self.heard.clone_from(&heard);
         let mut wanted = heard.iter().filter(|tag| tag.object_id == object);
         match (wanted.next(), wanted.count()) {
             (Some(tag), 0) => Ok(tag.clone()),
@@ -351,7 +353,7 @@ impl Run<'_> {
     }
 
     /// The object's record, checked against what the tag advertised.
-    fn record(&mut self, tag: &Advertisement) -> Result<Record, Stop> {
+    pub(crate) fn record(&mut self, tag: &Advertisement) -> Result<Record, Stop> {
         let timeout = self.config.link_timeout;
         let bytes = self.retry(|radio| radio.read_record(tag.address, timeout))?;
         let verdict = self.system.required_signers.as_ref().map(|keys| keys.judge(&bytes));

@@ -2,6 +2,8 @@
 //!
 //! ```text
 //! find -> plan -> transfer -> look again -> correct -> approach -> close -> lift -> verify
+//!                                ^                |                |
+//!                                '--- back off ---+----------------'   once
 //! ```
 //!
 //! In: an object's name. Out: the [`Report`] of the find with its `grasp` part; it is complete also
@@ -13,35 +15,41 @@
 //! Success is claimed only when the gripper feels the object after the lift *and* the heads have seen
 //! the landmark move as the hand did: both measure its place, or, when the hand hides it from one, the
 //! other sees it in the direction where the hand must have carried it. The second look is a correction,
-//! not a need: when the hand hides the object, the grasp stands on the first.
+//! not a need: when the hand hides the object, the grasp stands on the first. When it hides the lifted
+//! landmark from both heads, the hand turns and they look once more.
+//!
+//! A way that turns out to be blocked is gone back and the next best grasp tried; when the fingers close on
+//! nothing, the heads look again. Both happen once.
 
 use std::time::Duration;
 
-use nalgebra::{Point3, Translation3, Vector3};
-use vergence_devices::{
-    DeviceError, Execution, GripCommand, GripperReading, LedCommand, MotionLimits, Side, TagAddress,
+use nalgebra::{Translation3, Vector3};
+use vergence_devices::{DeviceError, Execution, GripCommand, GripperReading, MotionLimits, Side};
+use vergence_geometry::{Solid, Trajectory, Transform};
+use vergence_grasp::{
+    LiftVerdict, Obstacle, Plan, Refusal, Request, correct, next_best, plan, relative_to_hand,
+    turn_in_sight, verify_lift,
 };
-use vergence_geometry::{GaussianPoint, Solid, Trajectory};
-use vergence_grasp::{LiftVerdict, Obstacle, Plan, Refusal, Request, correct, plan, verify_lift};
-use vergence_tag::Pattern;
+
+use look::Sight;
 
 use crate::event::{Event, Observer};
 use crate::find::{FindConfig, Found, Run, Stop, describe};
 use crate::report::{GraspReport, Report};
 use crate::system::{Hand, System};
 
+mod look;
+
 /// Longest wait for the fingers to reach their goal.
 const FINGERS: Duration = Duration::from_secs(10);
 /// Longest wait for an answer of the arm's encoders.
 const ANSWER: Duration = Duration::from_secs(1);
 
-/// How far from where it was found the landmark may be seen at the second look (m).
-const SECOND_REACH: f64 = 0.06;
-/// How far from where the hand must have carried it the landmark is looked for (m): where it was before
-/// the lift, too.
-const LIFT_REACH: f64 = 0.15;
-/// How far from there one head alone may see it (m): what may slip in the fingers.
-const LIFT_PLACE: f64 = 0.02;
+/// Turns (rad) of the lifted hand that bring a landmark below it in sight: from under the palm's length
+/// to under its thickness, its light still turned to the heads. To one side, then to the other.
+const TURNS: [f64; 2] = [0.8, -1.6];
+/// Step in time (s) in which the place on a trajectory is sought where the arm has stopped.
+const STOPPED_STEP: f64 = 1e-3;
 
 /// Settings of a grasp.
 #[derive(Debug, Clone, Default)]
@@ -63,6 +71,8 @@ enum Failure {
     Refused(#[from] Refusal),
     #[error("{step}: {what}")]
     Motion { step: &'static str, what: String },
+    #[error("{step}: {link} touched something with {force:.1} N")]
+    Contact { step: &'static str, link: String, force: f64 },
     #[error("the fingers closed on nothing")]
     Empty,
     #[error("the object left the fingers during the lift")]
@@ -76,6 +86,17 @@ enum Failure {
 }
 
 impl Failure {
+    /// Before the object was lifted, and not for good: what is in the way or where the object is may be
+    /// otherwise for the next grasp or after another look.
+    fn is_worth_another_try(&self) -> bool {
+        matches!(
+            self,
+            Failure::Contact { .. }
+                | Failure::Empty
+                | Failure::Refused(Refusal::Occupied(_) | Refusal::Unreachable(_))
+        )
+    }
+
     /// What a person can do about it.
     fn hint(&self) -> &'static str {
         match self {
@@ -85,7 +106,9 @@ impl Failure {
             }
             Failure::Refused(Refusal::Unreachable(_)) => "move the object nearer to the arm",
             Failure::Refused(_) => "free the object's surroundings, or look from nearer",
-            Failure::Motion { .. } => "see what the arm touched, then bring it home",
+            Failure::Motion { .. } | Failure::Contact { .. } => {
+                "see what the arm touched, then bring it home"
+            }
             Failure::Empty | Failure::Dropped | Failure::NotLifted(_) => {
                 "check the record's size, weight and material"
             }
@@ -106,7 +129,10 @@ pub fn grasp(
     let found = run.all(object);
     let mut outcome = GraspReport::default();
     let failure = match &found {
-        Ok(found) => Attempt { run: &mut run, config, found, report: &mut outcome }.all().err(),
+        Ok(found) => {
+            let way = Vec::new();
+            Attempt { run: &mut run, config, found, report: &mut outcome, way }.all().err()
+        }
         Err(_) => None,
     };
     let mut report = describe(object, run, found.as_ref());
@@ -139,19 +165,39 @@ struct Attempt<'a, 'r> {
     config: &'a GraspConfig,
     found: &'a Found,
     report: &'a mut GraspReport,
+    /// What the arm has done since it last was where nothing is near.
+    way: Vec<Trajectory>,
 }
 
 impl Attempt<'_, '_> {
     fn all(&mut self) -> Result<(), Failure> {
         let hand = self.run.system.hand.clone().ok_or(Failure::NoArm)?;
         let planned = self.step("plan", |a| a.plan(&hand))?;
-        self.describe(&planned);
-        self.step("transfer", |a| a.transfer(&planned))?;
-        let again = self.step("look again", Self::look_again)?;
+        match self.carry_out(&hand, &planned) {
+            Err(failure) if failure.is_worth_another_try() => {
+                self.report.first_failure = Some(failure.to_string());
+                self.step("back off", |a| a.back_off(&planned))?;
+                let other = match failure {
+                    Failure::Empty => None,
+                    _ => next_best(&planned, &self.found.object.pose),
+                };
+                self.carry_out(&hand, &other.unwrap_or(planned))
+            }
+            outcome => outcome,
+        }
+    }
+
+    /// From where the arm stands to the object in the hand.
+    fn carry_out(&mut self, hand: &Hand, planned: &Plan) -> Result<(), Failure> {
+        self.describe(planned);
+        if self.report.first_failure.is_none() {
+            self.step("transfer", |a| a.transfer(planned))?;
+        }
+        let again = self.step("look again", |a| a.look_again(hand))?;
         self.run.observer.notice(&Event::Stage("pregrasp"));
-        let corrected = self.step("correct", |a| a.correct(&hand, &planned, &again))?;
+        let corrected = self.step("correct", |a| a.correct(hand, planned, &again))?;
         self.describe(&corrected);
-        self.report.corrected_by_mm = Some(shift_mm(&planned, &corrected));
+        self.report.corrected_by_mm = Some(shift_mm(planned, &corrected));
         self.step("approach", |a| {
             a.play("correction", &corrected.transfer, &a.config.limits.clone())?;
             a.play("approach", &corrected.approach, &a.config.limits.clone())
@@ -159,7 +205,20 @@ impl Attempt<'_, '_> {
         self.step("close", |a| a.close(&corrected))?;
         self.picture("closed")?;
         self.step("lift", |a| a.lift(&corrected))?;
-        self.step("verify", |a| a.verify(&hand, &corrected, &again))
+        self.step("verify", |a| a.verify(hand, &corrected, &again))
+    }
+
+    /// Opens the fingers and goes back the way that the arm has come; what it touched there lets go of
+    /// it, so only the stop button ends this motion.
+    fn back_off(&mut self, plan: &Plan) -> Result<(), Failure> {
+        self.grip(plan.grasp.opening, plan.force)?;
+        let limits = MotionLimits { contact_force: f64::INFINITY, ..self.config.limits.clone() };
+        while let Some(last) = self.way.pop() {
+            let stands = self.arm()?.read(ANSWER)?.positions;
+            self.play("back off", &last.back_from(nearest_time(&last, &stands)), &limits)?;
+            self.way.pop();
+        }
+        Ok(())
     }
 
     fn step<T>(
@@ -224,17 +283,31 @@ impl Attempt<'_, '_> {
         self.play("transfer", &plan.transfer, &self.config.limits.clone())
     }
 
-    /// The landmark is measured anew and the object recognised anew, from where the heads stand. The
-    /// plan was sure enough of the first look, so that holds when the second gives nothing.
-    fn look_again(&mut self) -> Result<Found, Failure> {
-        match self.run.again(self.found) {
-            Ok(found) => Ok(found),
-            Err(Stop::Device(error)) => Err(error.into()),
+    /// The landmark is measured anew and the object recognised anew, and placed beside the hand when that has
+    /// a light. The plan was sure enough of the first look, so that holds when the second gives nothing.
+    fn look_again(&mut self, hand: &Hand) -> Result<Found, Failure> {
+        let mut found = match self.run.again(self.found) {
+            Ok(found) => found,
+            Err(Stop::Device(error)) => return Err(error.into()),
             Err(stop) => {
                 self.report.second_look = Some(stop.to_string());
-                Ok(self.found.clone())
+                return Ok(self.found.clone());
             }
+        };
+        let Some(light) = &hand.light else { return Ok(found) };
+        let joints = self.arm()?.read(ANSWER)?.positions;
+        match self.run.hand_beside(light, &joints, &found) {
+            Ok(sight) => {
+                let pose = &mut found.object.pose;
+                // What the pose is unsure of beside what the heads get wrong is not told apart: all stays.
+                let unsure = pose.covariance.fixed_view::<3, 3>(3, 3) + sight.difference;
+                *pose = relative_to_hand(pose, &sight.by_joints, &sight.seen, &unsure);
+                self.report.hand_off_mm = Some(1e3 * (sight.by_joints - sight.seen).norm());
+            }
+            Err(Stop::Device(error)) => return Err(error.into()),
+            Err(stop) => self.report.hand_unseen = Some(stop.to_string()),
         }
+        Ok(found)
     }
 
     fn close(&mut self, plan: &Plan) -> Result<(), Failure> {
@@ -243,10 +316,14 @@ impl Attempt<'_, '_> {
         if reading.holding { Ok(()) } else { Err(Failure::Empty) }
     }
 
-    /// With the object in the hand contact is wanted: only the stop button ends this motion.
     fn lift(&mut self, plan: &Plan) -> Result<(), Failure> {
+        self.carry("lift", &plan.lift)
+    }
+
+    /// With the object in the hand contact is wanted: only the stop button ends this motion.
+    fn carry(&mut self, step: &'static str, trajectory: &Trajectory) -> Result<(), Failure> {
         let limits = MotionLimits { contact_force: f64::INFINITY, ..self.config.limits.clone() };
-        self.play("lift", &plan.lift, &limits)?;
+        self.play(step, trajectory, &limits)?;
         let held = self.arm()?.gripper(ANSWER)?.holding;
         if held { Ok(()) } else { Err(Failure::Dropped) }
     }
@@ -254,12 +331,18 @@ impl Attempt<'_, '_> {
     /// Looks where the landmark is now and compares with how the hand has moved.
     fn verify(&mut self, hand: &Hand, plan: &Plan, before: &Found) -> Result<(), Failure> {
         let unclear = Failure::NotLifted("the plan has no lift");
-        let motion = plan.lift_motion(&hand.robot.arm).ok_or(unclear)?;
-        let expected = GaussianPoint {
-            position: motion * before.landmark.position,
-            covariance: before.landmark.covariance,
-        };
-        let sight = self.run.sight(before.tag, &expected.position)?;
+        let mut motion = plan.lift_motion(&hand.robot.arm).ok_or(unclear)?;
+        let mut sight = self.run.sight(before.tag, &(motion * before.landmark.position));
+        for angle in TURNS {
+            if !matches!(sight, Err(Stop::NotSeen { .. } | Stop::Lost(_))) {
+                break;
+            }
+            if let Some(turn) = self.turn(hand, plan, before, angle)? {
+                motion = turn * motion;
+                sight = self.run.sight(before.tag, &(motion * before.landmark.position));
+            }
+        }
+        let sight = sight?;
         self.picture("lifted")?;
         let (by, verdict) = match sight {
             Sight::Place(after) => ("both heads", verify_lift(&before.landmark, &after, &motion)),
@@ -274,6 +357,28 @@ impl Attempt<'_, '_> {
             LiftVerdict::Left => Err(Failure::NotLifted("it stayed where it was")),
             LiftVerdict::Unclear => Err(Failure::NotLifted("the measurements do not tell")),
         }
+    }
+
+    /// Turns the hand with the object in it about the vertical; how it has moved (base), `None` when it
+    /// cannot.
+    fn turn(
+        &mut self,
+        hand: &Hand,
+        plan: &Plan,
+        before: &Found,
+        angle: f64,
+    ) -> Result<Option<Transform>, Failure> {
+        let start = self.arm()?.read(ANSWER)?.positions;
+        let obstacles = [table()];
+        let request = self.request(before, &start, &obstacles);
+        let planner = &self.config.planner;
+        let Some(turn) = turn_in_sight(&hand.robot, plan, &request, planner, &start, angle) else {
+            return Ok(None);
+        };
+        self.carry("turn", &turn)?;
+        let end = self.arm()?.read(ANSWER)?.positions;
+        let arm = &hand.robot.arm;
+        Ok(Some(arm.forward(&end) * arm.forward(&start).inverse()))
     }
 
     fn arm(&mut self) -> Result<&mut Box<dyn vergence_devices::Arm>, Failure> {
@@ -295,6 +400,7 @@ impl Attempt<'_, '_> {
     ) -> Result<(), Failure> {
         let (start, names) = (self.run.system.robot.clock.now(), self.arm()?.joint_names());
         self.run.observer.notice(&Event::Motion { start, names: &names, trajectory });
+        self.way.push(trajectory.clone());
         let outcome = self.arm()?.execute(trajectory, limits)?;
         let end = self.run.system.robot.clock.now();
         self.run.observer.notice(&Event::Moved { start, end, names: &names, trajectory });
@@ -303,7 +409,7 @@ impl Attempt<'_, '_> {
             Execution::Stopped => "stopped on command".into(),
             Execution::Contact { link, force } => {
                 self.report.contact = Some(link.clone());
-                format!("{link} touched something with {force:.1} N")
+                return Err(Failure::Contact { step, link, force });
             }
             Execution::Lost { reason } => reason,
         };
@@ -311,72 +417,19 @@ impl Attempt<'_, '_> {
     }
 }
 
+/// The time of a trajectory at which it is nearest to a posture.
+fn nearest_time(trajectory: &Trajectory, stands: &[f64; 6]) -> f64 {
+    let far = |time: f64| {
+        let at = trajectory.at(time).map_or(*stands, |w| w.positions);
+        at.iter().zip(stands).map(|(a, b)| (a - b).powi(2)).sum::<f64>()
+    };
+    let steps = (trajectory.duration() / STOPPED_STEP).ceil() as usize;
+    let times = (0..=steps).map(|n| (n as f64 * STOPPED_STEP).min(trajectory.duration()));
+    times.min_by(|a, b| far(*a).total_cmp(&far(*b))).unwrap_or(0.0)
+}
+
 /// How far the second look moved the grasp (mm).
 fn shift_mm(first: &Plan, second: &Plan) -> f64 {
     let (a, b) = (first.base_from_tip.translation.vector, second.base_from_tip.translation.vector);
     1e3 * (a - b).norm()
-}
-
-/// The LED is told to stop whatever came of the look.
-impl Run<'_> {
-    /// Measures the landmark and recognises the object once more, starting from where it was.
-    fn again(&mut self, found: &Found) -> Result<Found, Stop> {
-        let (landmark, angles) = self.relocate(found.tag, &found.landmark.position)?;
-        let frames = self.look()?;
-        let object = self.recognise(&found.record, landmark, &frames, angles)?;
-        Ok(Found { object, landmark, ..found.clone() })
-    }
-
-    /// Looks for the landmark where it should be (base): its place, or at least that one head sees it
-    /// in that direction.
-    fn sight(&mut self, tag: TagAddress, expected: &Point3<f64>) -> Result<Sight, Stop> {
-        self.lit(tag, |run, pattern| {
-            let seen = run.watch_near(pattern, expected, LIFT_REACH)?;
-            let there = [0, 1].map(|k| {
-                !run.within(k, seen[k].clone(), expected, LIFT_PLACE).sightings.is_empty()
-            });
-            match (run.locate_seen(tag, pattern, seen), there) {
-                (Ok((after, _)), _) => Ok(Sight::Place(after)),
-                (Err(Stop::Device(error)), _) => Err(error.into()),
-                (Err(_), [true, _]) => Ok(Sight::Direction(Side::Left)),
-                (Err(_), [_, true]) => Ok(Sight::Direction(Side::Right)),
-                (Err(stop), _) => Err(stop),
-            }
-        })
-    }
-
-    fn relocate(
-        &mut self,
-        tag: TagAddress,
-        near: &Point3<f64>,
-    ) -> Result<(GaussianPoint, [[f64; 2]; 2]), Stop> {
-        self.lit(tag, |run, pattern| {
-            let seen = run.watch_near(pattern, near, SECOND_REACH)?;
-            run.locate_seen(tag, pattern, seen)
-        })
-    }
-
-    /// Does something while the tag blinks. The report keeps where the landmark was found at first.
-    fn lit<T>(
-        &mut self,
-        tag: TagAddress,
-        work: impl FnOnce(&mut Self, &Pattern) -> Result<T, Stop>,
-    ) -> Result<T, Stop> {
-        let first = self.landmark.clone();
-        let pattern = self.start_blinking(tag)?;
-        let outcome = work(self, &pattern);
-        let stopped = self.command(tag, LedCommand::Stop);
-        self.landmark = first;
-        let outcome = outcome?;
-        stopped?;
-        Ok(outcome)
-    }
-}
-
-/// What a look for the lifted landmark gives.
-enum Sight {
-    /// Where it is: both heads saw it.
-    Place(GaussianPoint),
-    /// This head alone saw it where it should be.
-    Direction(Side),
 }

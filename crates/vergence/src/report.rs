@@ -71,9 +71,20 @@ pub struct GraspReport {
     /// How far the second look moved the grasp (mm).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub corrected_by_mm: Option<f64>,
+    /// How far from where the arm's joints put it the heads see the gripper's light, beside the object
+    /// (mm): so far the object was moved to be where the hand will find it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub hand_off_mm: Option<f64>,
+    /// Why the gripper's light was not measured, on a robot that has one; the object then stands where the
+    /// heads alone see it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub hand_unseen: Option<String>,
     /// What was between the fingers when they had closed (m).
     #[serde(skip_serializing_if = "Option::is_none")]
     pub closed_width: Option<f64>,
+    /// Why the first try ended, when there was a second.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub first_failure: Option<String>,
     /// Part of the arm that touched something on its way.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub contact: Option<String>,

@@ -6,6 +6,7 @@ use std::time::Duration;
 use vergence_devices::{
     Config, Description, DescriptionError, DeviceError, JointReading, Robot, Side,
 };
+use vergence_geometry::Chain;
 use vergence_head::PanTiltHead;
 use vergence_imaging::Frame;
 use vergence_tag::signature::TrustedKeys;
@@ -16,6 +17,11 @@ const POLL: Duration = Duration::from_millis(10);
 const SLEW_SLACK: Duration = Duration::from_secs(2);
 /// Longest wait for one picture.
 const FRAME_TIMEOUT: Duration = Duration::from_secs(2);
+/// How far from its goal a servo may rest beside its step (rad): friction keeps small ones half a degree off.
+const SHORT_OF_GOAL: f64 = 0.03;
+/// How far a stamp may lie ahead of the robot's clock: a picture of the future was stamped by a clock that
+/// was set, and may show the head before it came to rest.
+const AHEAD: Duration = Duration::from_millis(100);
 /// Pictures that may have been exposed before the heads stood still, at the most.
 const STALE_FRAMES: usize = 30;
 
@@ -55,20 +61,36 @@ pub struct System {
 pub struct Hand {
     /// Kinematics, solids and gripper.
     pub robot: vergence_grasp::Robot,
+    /// The tag on the gripper, when there is one.
+    pub light: Option<HandLight>,
+}
+
+/// The tag on a gripper.
+#[derive(Clone)]
+pub struct HandLight {
+    /// Object id that it advertises.
+    pub object_id: String,
+    /// From base to the frame of its record, over the arm's joints.
+    pub chain: Chain,
 }
 
 /// The links that every description of an arm has.
 const ARM_LINKS: [&str; 3] = ["base", "tcp", "hand"];
 
 impl Hand {
-    /// Reads the links `tcp` and `hand` of a description.
-    pub fn read(description: &Description) -> Result<Self, SystemError> {
+    /// Reads the links `tcp` and `hand` of a description, and that of the gripper's tag.
+    pub fn read(config: &Config, description: &Description) -> Result<Self, SystemError> {
         let [base, tcp, hand] = ARM_LINKS;
         let chain = description.chain(base, tcp)?;
         let bodies = description.bodies(base, &chain)?;
         let gripper = description.gripper(hand)?;
         let robot = vergence_grasp::Robot::new(chain, &bodies, gripper.travel, gripper.effort)?;
-        Ok(Hand { robot })
+        let tag = config.arm.as_ref().and_then(|arm| arm.tag.as_ref());
+        let light = tag.map(|tag| {
+            let chain = description.chain(base, &tag.link)?;
+            Ok::<_, DescriptionError>(HandLight { object_id: tag.object_id.clone(), chain })
+        });
+        Ok(Hand { robot, light: light.transpose()? })
     }
 }
 
@@ -87,7 +109,7 @@ impl System {
                 .map(|chain| PanTiltHead { chain, camera: wiring.camera.model() })
                 .map_err(|source| SystemError::Description { side: side.name(), source })
         };
-        let hand = robot.arm.is_some().then(|| Hand::read(description)).transpose()?;
+        let hand = robot.arm.is_some().then(|| Hand::read(config, description)).transpose()?;
         let heads = [head(Side::Left)?, head(Side::Right)?];
         Ok(System { robot, heads, required_signers: None, hand })
     }
@@ -123,6 +145,7 @@ impl System {
             self.robot.clock.sleep(POLL);
             let joints = self.joints()?;
             if joints.iter().all(|j| !j.moving) {
+                self.arrived(&targets, &joints)?;
                 return Ok(joints);
             }
             if self.robot.clock.now() > deadline {
@@ -133,6 +156,32 @@ impl System {
                 });
             }
         }
+    }
+
+    /// Fails when a head rests elsewhere than it was sent to.
+    fn arrived(
+        &self,
+        targets: &[Option<[f64; 2]>; 2],
+        joints: &[JointReading; 2],
+    ) -> Result<(), DeviceError> {
+        for k in 0..2 {
+            let Some(target) = targets[k].map(|angles| self.heads[k].clamp(angles)) else {
+                continue;
+            };
+            let off = [joints[k].pan - target[0], joints[k].tilt - target[1]];
+            let allowed = SHORT_OF_GOAL + self.robot.heads[k].pan_tilt.resolution();
+            if let Some(joint) = (0..2).find(|&joint| off[joint].abs() > allowed) {
+                return Err(DeviceError::Fault {
+                    device: format!("{} head", Side::BOTH[k].name()),
+                    fault: format!(
+                        "{} rests {:.1} degrees from where it was sent to",
+                        ["pan", "tilt"][joint],
+                        off[joint].abs().to_degrees()
+                    ),
+                });
+            }
+        }
+        Ok(())
     }
 
     /// Pictures of both heads that were taken together, at most `apart` from each other, and not
@@ -163,13 +212,20 @@ impl System {
         self.robot.heads[side].camera.skip_before(since);
         for _ in 0..STALE_FRAMES {
             let frame = self.robot.heads[side].camera.next_frame(FRAME_TIMEOUT)?;
+            if frame.stamp > self.robot.clock.now() + AHEAD {
+                return Err(untimely(side, "ahead of"));
+            }
             if frame.stamp >= since {
                 return Ok(frame);
             }
         }
-        Err(DeviceError::Fault {
-            device: format!("{} camera", Side::BOTH[side].name()),
-            fault: "its time stamps lie behind the robot's clock".into(),
-        })
+        Err(untimely(side, "behind"))
+    }
+}
+
+fn untimely(side: usize, how: &str) -> DeviceError {
+    DeviceError::Fault {
+        device: format!("{} camera", Side::BOTH[side].name()),
+        fault: format!("its time stamps lie {how} the robot's clock"),
     }
 }

@@ -11,6 +11,8 @@ use vergence_head::evaluation::{
     evaluate_kind, time_to_fixation,
 };
 
+use vergence_head::ReaimConfig;
+
 use crate::failure::Failure;
 
 /// What to evaluate.
@@ -43,7 +45,7 @@ struct Head {
     #[arg(long, default_value_t = EvaluationConfig::default().heads)]
     heads: usize,
     /// Most re-aims of one measurement, a find's when left out.
-    #[arg(long, default_value_t = vergence::FindConfig::default().reaims)]
+    #[arg(long, default_value_t = EvaluationConfig::default().reaim.most)]
     aims: usize,
     /// Places of the light for the calibration.
     #[arg(long, default_value_t = EvaluationConfig::default().places)]
@@ -125,19 +127,18 @@ fn run_head(args: &Head) -> Result<bool, Failure> {
             ));
         }
     }
-    let find = vergence::FindConfig::default();
+    let defaults = EvaluationConfig::default();
     let config = EvaluationConfig {
-        depth_sigma: find.depth_sigma,
         placements: args.placements,
         heads: args.heads,
-        aims: args.aims,
+        reaim: ReaimConfig { most: args.aims, ..defaults.reaim },
         places: args.places,
         light: match args.light {
             Light::Ruler => LightSource::Ruler,
             Light::Arm => LightSource::Arm,
         },
         seed: args.seed,
-        ..EvaluationConfig::default()
+        ..defaults
     };
     let mut figures = Vec::new();
     for kind in &SERVO_KINDS {
@@ -174,6 +175,7 @@ fn document(
                 "mean_aims": f.mean_aims,
                 "refused_before": f.refused_before,
                 "held_out_rms_px": f.held_out_rms_px,
+                "held_out_again_rms_px": f.held_out_again_rms_px,
                 "model_rms_px": f.model_rms_px,
                 "calibration_coverage": f.coverage,
                 "coverage_trials": config.trials,
@@ -185,7 +187,7 @@ fn document(
     json!({
         "placements": config.placements,
         "heads": config.heads,
-        "aims": config.aims,
+        "aims": config.reaim.most,
         "patient_aims": config.patient_aims,
         "baseline": config.baseline,
         "distance": config.distance,
@@ -216,6 +218,7 @@ fn print_table(config: &EvaluationConfig, figures: &[ServoFigures], timing: &Tim
     let patient = format!("  calibrated, {} re-aims", config.patient_aims);
     row(&patient, "mm", &|f| 1e3 * f.depth_rms_patient);
     row("prediction of held-out views, rms", "px", &|f| f.held_out_rms_px);
+    row("  angles by the re-aims of a find", "px", &|f| f.held_out_again_rms_px);
     row("  without encoder and pixel noise", "px", &|f| f.model_rms_px);
     let trials = format!("within the predicted 95 %, {} heads", config.trials);
     row(&trials, "%", &|f| 100.0 * f.coverage);

@@ -2,6 +2,7 @@
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
 use clap::Args;
@@ -13,6 +14,7 @@ use vergence_sim::{WiredWorkcell, Workcell, fitting_servo};
 
 use crate::failure::Failure;
 use crate::interrupt::Interrupt;
+use crate::light::coordinates;
 use crate::robot::RobotArgs;
 
 /// Offer the simulated workcell's devices over the wires of real ones: servos on a pseudo-terminal,
@@ -28,6 +30,10 @@ pub struct Sim {
     /// End after so many seconds.
     #[arg(long, value_name = "SECONDS")]
     seconds: Option<f64>,
+    /// Read lines "OBJECT X Y Z" from standard input and hold that object's light there (m, base), shining
+    /// towards the heads: for `vergence calibrate` over the wires.
+    #[arg(long)]
+    hold: bool,
     /// Print where the devices are as one line of JSON.
     #[arg(long)]
     json: bool,
@@ -60,11 +66,34 @@ pub fn run(args: &Sim) -> Result<bool, Failure> {
         write_config(&wired, path, &urdf)?;
     }
     print(args, &wired)?;
+    let lines = args.hold.then(typed);
     let start = Instant::now();
     while !interrupt.raised() && lasting.is_none_or(|lasting| start.elapsed() < lasting) {
         std::thread::sleep(POLL);
+        lines.iter().flat_map(Receiver::try_iter).for_each(|line| hold(&wired, &line));
     }
     Ok(true)
+}
+
+/// What is typed, line by line.
+fn typed() -> Receiver<String> {
+    let (sender, lines) = channel();
+    std::thread::spawn(move || {
+        let mut typed = std::io::stdin().lines().map_while(Result::ok);
+        while typed.next().is_some_and(|line| sender.send(line).is_ok()) {}
+    });
+    lines
+}
+
+/// Holds a light where a line says; a line that says nothing is answered with what it should say.
+fn hold(wired: &WiredWorkcell, line: &str) {
+    let said =
+        line.trim().split_once(' ').and_then(|(object, at)| Some((object, coordinates(at)?)));
+    match said {
+        Some((object, at)) if wired.hold_light(object, &at) => eprintln!("{object} is held"),
+        Some((object, _)) => eprintln!("there is no object \"{object}\" with a light"),
+        None => eprintln!("type OBJECT X Y Z, for example: cup 0.8 0.1 0.3"),
+    }
 }
 
 /// The model that the wiring names for the left head, else the one nearest to the settings.

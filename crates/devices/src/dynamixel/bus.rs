@@ -25,9 +25,10 @@ pub struct BusConfig {
 }
 
 impl Default for BusConfig {
-    /// The factory's 1 Mbaud of AX; three attempts of 34 ms, the time that ROBOTIS' SDK waits too.
+    /// The factory's 1 Mbaud of AX; attempts of 34 ms, the time that ROBOTIS' SDK waits too, for a quarter
+    /// of a second: a busy computer may not come to its port for a tenth.
     fn default() -> Self {
-        BusConfig { baud: 1_000_000, latency: Duration::from_millis(34), attempts: 3 }
+        BusConfig { baud: 1_000_000, latency: Duration::from_millis(34), attempts: 8 }
     }
 }
 

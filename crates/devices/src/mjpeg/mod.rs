@@ -51,6 +51,17 @@ pub struct MjpegConfig {
     /// Exposure time (s), when known.
     #[serde(default)]
     pub exposure: f64,
+    /// Time (s) from the start of an exposure until the first bytes of its picture arrive, at the least.
+    /// Pictures whose exposure began before a head came to rest are thrown away by their stamp: too much
+    /// costs a picture after each move, too little lets in one of the move, which shows the light
+    /// elsewhere.
+    #[serde(default = "default_latency")]
+    pub latency: f64,
+}
+
+/// A picture interval and a little: cameras expose, read out, compress and send in turn.
+fn default_latency() -> f64 {
+    0.05
 }
 
 /// A camera behind HTTP.
@@ -95,11 +106,10 @@ impl MjpegCamera {
             |what: String| DeviceError::Unsupported { device: config.url.clone(), what };
         let target = Target::parse(&config.url)
             .ok_or_else(|| unsupported("the address is not http://host[:port]/path".into()))?;
-        if !(config.exposure.is_finite() && (0.0..10.0).contains(&config.exposure)) {
-            return Err(unsupported(format!(
-                "exposure {} s is not between 0 and 10 s",
-                config.exposure
-            )));
+        for (name, seconds) in [("exposure", config.exposure), ("latency", config.latency)] {
+            if !(0.0..10.0).contains(&seconds) {
+                return Err(unsupported(format!("{name} {seconds} s is not between 0 and 10 s")));
+            }
         }
         let shared = Arc::new(Shared::default());
         let first = target.connect(&shared).map_err(|e| DeviceError::Disconnected {
@@ -111,6 +121,7 @@ impl MjpegCamera {
             shared: shared.clone(),
             clock,
             timing: Timing::default(),
+            latency: Duration::from_secs_f64(config.latency),
             last: Vec::new(),
             repeats: 0,
         };
@@ -234,6 +245,7 @@ struct Reader {
     shared: Arc<Shared>,
     clock: Arc<dyn Clock>,
     timing: Timing,
+    latency: Duration,
     /// The picture before, and how often it came again.
     last: Vec<u8>,
     repeats: usize,
@@ -293,7 +305,8 @@ impl Reader {
             return;
         }
         self.repeats = 0;
-        let (stamp, sequence) = self.timing.place(part.arrival, part.timestamp);
+        let (stamp, sequence) =
+            self.timing.place(part.arrival.saturating_sub(self.latency), part.timestamp);
         self.last.clone_from(&part.body);
         let picture = Picture { jpeg: part.body, stamp, sequence };
         let mut state = self.shared.lock();

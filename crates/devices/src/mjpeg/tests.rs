@@ -40,7 +40,7 @@ fn server(scripts: Vec<Script>) -> String {
 }
 
 fn open(url: &str) -> Result<MjpegCamera, DeviceError> {
-    let config = MjpegConfig { url: url.into(), exposure: 0.004 };
+    let config = MjpegConfig { url: url.into(), exposure: 0.004, latency: 0.05 };
     MjpegCamera::open(&config, (32, 24), Arc::new(SystemClock::start()))
 }
 

@@ -13,8 +13,8 @@ mod world;
 use rand::SeedableRng;
 use rand_pcg::Pcg64Mcg;
 
-use crate::Noise;
 use crate::calibration::{CalibrationConfig, calibrate};
+use crate::{Noise, ReaimConfig};
 pub use equation::{EquationError, equation_errors};
 pub use timing::{Timing, time_to_fixation};
 use world::World;
@@ -62,10 +62,8 @@ pub struct EvaluationConfig {
     pub baseline: f64,
     /// Distance of the lights (m).
     pub distance: f64,
-    /// Most re-aims per head of one measurement: as many as a find makes.
-    pub aims: usize,
-    /// Standard deviation of the distance (m) that ends the re-aims: a find's.
-    pub depth_sigma: f64,
+    /// Re-aims of one measurement: a find's.
+    pub reaim: ReaimConfig,
     /// Re-aims per head of a patient measurement.
     pub patient_aims: usize,
     /// Centroid noise (px, one sigma, per coordinate).
@@ -90,8 +88,7 @@ impl Default for EvaluationConfig {
             heads: 20,
             baseline: 0.2,
             distance: 1.0,
-            aims: 16,
-            depth_sigma: 0.002,
+            reaim: ReaimConfig::default(),
             patient_aims: 64,
             pixel_sigma: 0.1,
             places: 40,
@@ -124,7 +121,9 @@ pub struct ServoFigures {
     /// Prediction of held-out sightings with all four joints moving (px, rms over both coordinates),
     /// encoder and centroid noise included.
     pub held_out_rms_px: f64,
-    /// The same against the true projection: the calibration's own error.
+    /// The same with the joint angles told by the re-aims of a find instead of one encoder reading.
+    pub held_out_again_rms_px: f64,
+    /// The single prediction against the true projection: the calibration's own error.
     pub model_rms_px: f64,
     /// Part of the trials, each with a head and a short calibration of its own, in which the distance
     /// error, free of measurement noise, lies within the predicted 95 % interval.
@@ -158,7 +157,7 @@ pub fn evaluate_kind(kind: &ServoKind, config: &EvaluationConfig) -> ServoFigure
             sums.refused_calibrations += 1;
             continue;
         };
-        world.hold_out(&session, &calibration, &mut random, &mut sums);
+        world.hold_out(&session, &calibration, config, &mut random, &mut sums);
         for _ in 0..share {
             let light = world.new_light(config.distance, &mut random);
             world.measure(&light, &calibration, config, &mut random, &mut sums);
@@ -191,6 +190,7 @@ struct Sums {
     patient: Vec<f64>,
     covered: Vec<f64>,
     held_out: Vec<f64>,
+    held_out_again: Vec<f64>,
     model: Vec<f64>,
     refused_calibrations: usize,
     refused_trials: usize,
@@ -209,6 +209,7 @@ impl Sums {
             mean_aims: mean(&self.aims),
             depth_rms_patient: rms(&self.patient),
             held_out_rms_px: rms(&self.held_out),
+            held_out_again_rms_px: rms(&self.held_out_again),
             model_rms_px: rms(&self.model),
             coverage: mean(&self.covered),
             refused_calibrations: self.refused_calibrations,

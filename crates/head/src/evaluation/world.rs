@@ -4,21 +4,19 @@
 use nalgebra::{Matrix2, Point2, Point3, Vector2, Vector3};
 use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
-use vergence_geometry::{Camera, Chain, Joint, Limits, Ray, Transform, optical_from_body};
+use vergence_geometry::{Camera, Chain, Joint, Limits, Transform, optical_from_body};
 
 use crate::calibration::{
     Calibration, HEAD_UNKNOWNS, HeadVector, KnownLength, LightPlace, apply, middle,
 };
 use crate::triangulation::nearest_to_rays;
 use crate::{
-    Fixation, Fixator, FixatorConfig, Landmark, NextMove, Noise, PanTiltHead, dither,
-    triangulate_many,
+    Fixation, Fixator, FixatorConfig, Landmark, NextMove, Noise, PanTiltHead, Reaim, ReaimConfig,
+    bounded, triangulate,
 };
 
 use super::{EvaluationConfig, LightSource, ServoKind, Sums};
 
-/// Re-aims between two looks at what has been reached, as in a find.
-const BATCH: usize = 4;
 /// What a find takes for unknown of the slack once it lies on one side, as a part of the stated slack.
 const OWN_SLACK_SIGMA: f64 = 0.072;
 
@@ -120,15 +118,27 @@ impl World {
         reach: [f64; 2],
         random: &mut Pcg64Mcg,
     ) -> Vec<Fixation> {
-        let centre = self.truth[k].aim_at(light);
-        let mut servos = Servos::at(centre);
         (0..views)
             .filter_map(|_| {
-                let goal = [0, 1].map(|j| centre[j] + reach[j] * random.random_range(-1.0..1.0));
-                servos.arrive(self.truth[k].clamp(goal), &self.kind, random);
+                let servos = self.turned_by(k, light, reach, random);
                 self.sight(k, light, &servos, random)
             })
             .collect()
+    }
+
+    /// The servos turned from looking at a light to anywhere within `reach`.
+    fn turned_by(
+        &self,
+        k: usize,
+        light: &Point3<f64>,
+        reach: [f64; 2],
+        random: &mut Pcg64Mcg,
+    ) -> Servos {
+        let centre = self.truth[k].aim_at(light);
+        let goal = [0, 1].map(|j| centre[j] + reach[j] * random.random_range(-1.0..1.0));
+        let mut servos = Servos::at(centre);
+        servos.arrive(self.truth[k].clamp(goal), &self.kind, random);
+        servos
     }
 
     /// What is seen of a light where the servos stand: told angles, noisy pixel.
@@ -151,15 +161,14 @@ impl World {
         })
     }
 
-    /// Fixates a light as the robot would, then re-aims around it.
+    /// Fixates a light as the robot would.
     fn fixate(
         &self,
         k: usize,
         believed: &PanTiltHead,
         light: &Point3<f64>,
-        aims: usize,
         random: &mut Pcg64Mcg,
-    ) -> Vec<Fixation> {
+    ) -> Servos {
         let mut start = self.truth[k].aim_at(light);
         start =
             [start[0] + random.random_range(-0.2..0.2), start[1] + random.random_range(-0.2..0.2)];
@@ -179,15 +188,34 @@ impl World {
                 }
             }
         }
-        // Far enough apart that every aim falls into another part of a step.
-        let reach = 6.0 * self.kind.step;
-        dither(servos.told, reach, aims)
-            .into_iter()
-            .filter_map(|goal| {
-                servos.arrive(goal, &self.kind, random);
-                self.sight(k, light, &servos, random)
-            })
-            .collect()
+        servos
+    }
+
+    /// Aims at a light again and again, as a find does.
+    fn reaim<'h>(
+        &self,
+        believed: &'h [PanTiltHead; 2],
+        light: &Point3<f64>,
+        mut servos: [Servos; 2],
+        config: ReaimConfig,
+        random: &mut Pcg64Mcg,
+    ) -> Reaim<'h> {
+        let common_sigma = OWN_SLACK_SIGMA * self.kind.backlash;
+        let noise = Noise { common_sigma, ..Noise::of_servo(self.kind.step, 0.0) };
+        let centre = [0, 1].map(|k| servos[k].told);
+        let mut reaim = Reaim::new(believed, centre, [self.kind.step; 2], noise, config);
+        let below = reaim.run_up([self.kind.backlash; 2]);
+        (0..2).for_each(|k| servos[k].go(below[k], &self.kind, random));
+        // A light that got no distance has none with more aims either.
+        while let Ok(Some(goals)) = reaim.next_aim() {
+            for k in 0..2 {
+                servos[k].go(goals[k], &self.kind, random);
+                if let Some(fixation) = self.sight(k, light, &servos[k], random) {
+                    reaim.add(k, fixation);
+                }
+            }
+        }
+        reaim
     }
 
     /// Distances of one new light, before and after calibration.
@@ -200,7 +228,10 @@ impl World {
         sums: &mut Sums,
     ) {
         let true_distance = (light - middle(&self.truth)).norm();
-        let raw = [0, 1].map(|k| self.fixate(k, &self.nominal[k], light, config.aims, random));
+        let raw = [0, 1].map(|k| {
+            let servos = self.fixate(k, &self.nominal[k], light, random);
+            self.sight(k, light, &servos, random)
+        });
         match self.described_distance(&raw) {
             Some(distance) => sums.before.push(distance - true_distance),
             None => {
@@ -209,36 +240,30 @@ impl World {
             }
         }
         let heads = &calibration.heads;
-        let common_sigma = OWN_SLACK_SIGMA * self.kind.backlash;
-        let noise = Noise { common_sigma, ..Noise::of_servo(self.kind.step, 0.0) };
-        let seen = [0, 1].map(|k| self.fixate(k, &heads[k], light, config.aims, random));
         let from = middle(heads);
-        let landmark = |count: usize| {
-            let [left, right] = [0, 1].map(|k| &seen[k][..count.min(seen[k].len())]);
-            triangulate_many(heads, [left, right], &noise).ok()
-        };
         let error = |landmark: Option<Landmark>| {
             landmark.map_or(true_distance, |l| (l.point.position - from).norm() - true_distance)
         };
-        // As a find does: until the distance is known well enough.
-        let enough = |count: usize| {
-            landmark(count).is_some_and(|l| l.distance_from(&from).1 <= config.depth_sigma)
-        };
-        let count = (BATCH..config.aims).step_by(BATCH).find(|n| enough(*n)).unwrap_or(config.aims);
-        sums.after.push(error(landmark(count)));
-        sums.aims.push(count as f64);
-        sums.single.push(error(landmark(1)));
-        let seen = [0, 1].map(|k| self.fixate(k, &heads[k], light, config.patient_aims, random));
-        let patient = triangulate_many(heads, [&seen[0], &seen[1]], &noise).ok();
-        sums.patient.push(error(patient));
+        let servos = [0, 1].map(|k| self.fixate(k, &heads[k], light, random));
+        let single = [0, 1].map(|k| self.sight(k, light, &servos[k], random));
+        let noise = Noise::of_servo(self.kind.step, self.kind.backlash);
+        sums.single.push(error(match single {
+            [Some(left), Some(right)] => triangulate(heads, &[left, right], &noise).ok(),
+            _ => None,
+        }));
+        let found = self.reaim(heads, light, servos, config.reaim, random);
+        sums.after.push(error(found.landmark().ok().flatten()));
+        sums.aims.push(found.aims() as f64);
+        let patience = ReaimConfig { depth_sigma: 0.0, least_gain: 0.0, most: config.patient_aims };
+        let servos = [0, 1].map(|k| self.fixate(k, &heads[k], light, random));
+        let patient = self.reaim(heads, light, servos, patience, random);
+        sums.patient.push(error(patient.landmark().ok().flatten()));
     }
 
-    /// Distance by the description, from the point nearest to all rays; `None` when that is behind.
-    fn described_distance(&self, seen: &[Vec<Fixation>; 2]) -> Option<f64> {
-        let rays: Vec<Ray> = (0..2)
-            .flat_map(|k| seen[k].iter().map(move |f| (k, f)))
-            .map(|(k, f)| self.nominal[k].ray(f.angles, &f.pixel))
-            .collect();
+    /// Distance by the description, from the point nearest to both rays; `None` when that is behind.
+    fn described_distance(&self, seen: &[Option<Fixation>; 2]) -> Option<f64> {
+        let ray = |k: usize| seen[k].map(|f| self.nominal[k].ray(f.angles, &f.pixel));
+        let rays = [ray(0)?, ray(1)?];
         let off = nearest_to_rays(&rays)? - middle(&self.nominal);
         (off.dot(&rays[0].direction) > 0.0).then(|| off.norm())
     }
@@ -260,27 +285,40 @@ impl World {
         sums.covered.push(f64::from(u8::from(error.abs() <= 1.96 * sigma)));
     }
 
-    /// Predicts sightings of the calibration's lights from new angles of all joints.
+    /// Predicts sightings of the calibration's lights from new angles of all joints: a single one, and
+    /// what the re-aims of a find make of the angles there.
     pub(super) fn hold_out(
         &self,
         session: &Session,
         calibration: &Calibration,
+        config: &EvaluationConfig,
         random: &mut Pcg64Mcg,
         sums: &mut Sums,
     ) {
+        const POSES: usize = 4;
+        let (heads, reach) = (&calibration.heads, [0.35, 0.25]);
+        let step_sigma = Noise::of_servo(self.kind.step, 0.0).step_sigma;
         for (light, found) in session.lights.iter().zip(&calibration.lights) {
-            for k in 0..2 {
-                for seen in self.look_around(k, light, 4, [0.35, 0.25], random) {
-                    let predicted = calibration.heads[k].project(seen.angles, found);
-                    let Some(predicted) = predicted else { continue };
+            for _ in 0..POSES {
+                let servos = [0, 1].map(|k| self.turned_by(k, light, reach, random));
+                for k in 0..2 {
+                    let Some(seen) = self.sight(k, light, &servos[k], random) else { continue };
+                    let Some(predicted) = heads[k].project(seen.angles, found) else { continue };
                     let off = predicted - seen.pixel;
                     sums.held_out.extend([off.x, off.y]);
-                    let slack = self.kind.backlash / 2.0;
-                    let shaft = seen.angles.map(|a| a - slack);
+                    let shaft = seen.angles.map(|a| a - self.kind.backlash / 2.0);
                     if let Some(real) = self.truth[k].project(shaft, light) {
                         let off = predicted - real;
                         sums.model.extend([off.x, off.y]);
                     }
+                }
+                let again = self.reaim(heads, light, servos, config.reaim, random);
+                for k in 0..2 {
+                    let seen = bounded::combine(&heads[k], &again.seen()[k], step_sigma, found);
+                    let Some(seen) = seen else { continue };
+                    let Some(predicted) = heads[k].project(seen.angles, found) else { continue };
+                    let off = predicted - seen.pixel;
+                    sums.held_out_again.extend([off.x, off.y]);
                 }
             }
         }

@@ -23,8 +23,12 @@ const CLOCK_TOLERANCE: f64 = 2e-4;
 const LONGEST_WATCH: Duration = Duration::from_secs(6);
 
 impl Run<'_> {
-    /// Chooses the pattern and has the tag play it.
-    pub(crate) fn start_blinking(&mut self, tag: TagAddress) -> Result<Pattern, Stop> {
+    /// Chooses the pattern and has the tag play it with one of its lights.
+    pub(crate) fn start_blinking(
+        &mut self,
+        tag: TagAddress,
+        landmark: u8,
+    ) -> Result<Pattern, Stop> {
         let interval = self.frame_interval()?;
         self.interval = interval;
         let rate = 1.0 / interval.as_secs_f64().max(1e-3);
@@ -33,6 +37,7 @@ impl Run<'_> {
             Method::Directional => codebook::assign(0, rate),
         };
         let pattern = pattern.ok_or_else(|| rate_fault(interval))?;
+        let pattern = Pattern { landmark, ..pattern };
         self.command(tag, LedCommand::Play(pattern))?;
         Ok(pattern)
     }
@@ -64,20 +69,21 @@ impl Run<'_> {
 
     /// Watches through both cameras, the heads being still, until either knows whether the pattern
     /// is in its view. A side without a reading is not watched and sees nothing.
-    pub(super) fn watch(
+    pub(crate) fn watch(
         &mut self,
         pattern: &Pattern,
         joints: [Option<JointReading>; 2],
     ) -> Result<[Vec<Sighting>; 2], Stop> {
         let start = self.system.robot.clock.now();
-        let mut finders = [self.finder(pattern)?, self.finder(pattern)?];
+        let finder = |side: Side| self.finder(pattern).map_err(|e| Stop::Frames(side.name(), e));
+        let mut finders = [finder(Side::Left)?, finder(Side::Right)?];
         let mut open = joints.map(|j| j.is_some());
         while open.contains(&true) && self.system.robot.clock.now() < start + LONGEST_WATCH {
             for side in 0..2 {
                 let Some(reading) = joints[side].filter(|_| open[side]) else { continue };
                 let frame = self.system.frame_since(side, start)?;
                 self.observer.notice(&Event::Frame(Side::BOTH[side], &frame, reading));
-                finders[side].push(&frame)?;
+                finders[side].push(&frame).map_err(|e| Stop::Frames(Side::BOTH[side].name(), e))?;
                 open[side] = !finders[side].is_done();
             }
         }

@@ -116,11 +116,15 @@ impl Run<'_> {
         session: &mut Session,
     ) -> Result<(), Stop> {
         while let Some(placed) = mover.next_place()? {
-            let pattern = self.step("blink", |run| run.start_blinking(tag))?;
-            let place = self.step("look around", |run| {
-                let place = run.look_around(tag, &pattern, views)?;
-                Ok(LightPlace { known: placed.known, ..place })
-            })?;
+            let pattern = self.step("blink", |run| run.start_blinking(tag, 0))?;
+            let looked = self.step("look around", |run| run.look_until_seen(tag, &pattern, views));
+            let place = match looked {
+                // One place out of sight, or beside a mirror, does not undo the others.
+                Err(Stop::NotSeen { .. } | Stop::Lost(_)) if !session.places.is_empty() => {
+                    LightPlace::default()
+                }
+                looked => LightPlace { known: placed.known, ..looked? },
+            };
             let index = session.places.len();
             session.missed += place.fixations.iter().map(|seen| views - seen.len()).sum::<usize>();
             session.places.push(place);
@@ -131,6 +135,26 @@ impl Run<'_> {
             }
         }
         Ok(())
+    }
+
+    /// A light that was lost or seen by one head only is searched again, as in a find.
+    fn look_until_seen(
+        &mut self,
+        tag: TagAddress,
+        pattern: &Pattern,
+        views: usize,
+    ) -> Result<LightPlace, Stop> {
+        let mut tries = 1;
+        loop {
+            match self.look_around(tag, pattern, views) {
+                Err(Stop::NotSeen { .. } | Stop::Lost(_)) if tries < self.config.search_tries => {
+                    tries += 1;
+                    // A search may take as long as the tag plays.
+                    self.command(tag, LedCommand::Play(*pattern))?;
+                }
+                outcome => return outcome,
+            }
+        }
     }
 
     /// Finds the light at its place and looks at it from `views` angles.

@@ -1,9 +1,9 @@
-//! A tighter landmark: both heads aim at the light again and again, an encoder step further each time.
+//! A tighter landmark: both heads aim at the light again and again ([`Reaim`]).
 //!
 //! One fixation knows a joint's angle to the encoder's step only, which at 0.35 degrees and a baseline
-//! of 0.2 m is a centimetre of distance. At another step the servo stops elsewhere within it, so the
-//! steps average out. The tag plays a flicker of one and a half frames meanwhile: among any three
-//! frames one is lit and one is dark, and an angle costs three frames and a move of one step.
+//! of 0.2 m is a centimetre of distance. The tag plays a flicker of one and a half frames meanwhile:
+//! among any three frames one is lit and one is dark, and an angle costs three frames and a move of one
+//! step.
 //!
 //! The joints go upwards only, after one run-up, so that the slack always lies on the same side: the
 //! camera trails its motor by half the slack. What remains unknown of that is small ([`LAG`]).
@@ -12,9 +12,9 @@
 //! place tell the angles better than the encoder does ([`settle`]).
 
 use nalgebra::{Matrix2, Point3, Vector2};
-use vergence_devices::{JointReading, LedCommand, Side, TagAddress};
+use vergence_devices::{JointReading, LedCommand, PanTilt, Side, TagAddress};
 use vergence_geometry::GaussianPoint;
-use vergence_head::{Fixation, Noise, PanTiltHead, triangulate_many};
+use vergence_head::{Fixation, Noise, PanTiltHead, Reaim};
 use vergence_imaging::Frame;
 use vergence_landmark::near;
 use vergence_tag::{Pattern, pattern::Bits};
@@ -24,14 +24,9 @@ use crate::event::Event;
 
 /// Frames an angle is looked at for.
 const FRAMES: usize = 3;
-/// Angles between two looks at what has been reached.
-const BATCH: usize = 4;
 /// By how much a camera trails its motor when it came from below, and the standard deviation of that,
 /// as shares of the slack that the maker states: a servo has between half of that and all of it.
 const LAG: (f64, f64) = (0.375, 0.072);
-
-/// Fixations of either head.
-type Fixations = [Vec<Fixation>; 2];
 
 impl Run<'_> {
     /// Measures the light again at other angles until its distance is known well enough; gives its
@@ -43,7 +38,14 @@ impl Run<'_> {
         first: GaussianPoint,
     ) -> Result<(GaussianPoint, [[f64; 2]; 2]), Stop> {
         let angles = held.map(|fixation| fixation.angles);
-        if self.config.reaims < BATCH || self.depth_sigma(&first) <= self.config.depth_sigma {
+        let heads = self.system.heads.clone();
+        let servos = |servo: fn(&dyn PanTilt) -> f64| {
+            [0, 1].map(|k| servo(self.system.robot.heads[k].pan_tilt.as_ref()))
+        };
+        let (steps, slack) = (servos(|s| s.resolution()), servos(|s| s.backlash()));
+        let noise = self.noise_from_below();
+        let mut reaim = Reaim::new(&heads, angles, steps, noise, self.config.reaim);
+        if !reaim.begins(&first) {
             return Ok((first, angles));
         }
         // 1.5 frames: whatever the phase, one of three frames is fully lit and one fully dark.
@@ -51,59 +53,25 @@ impl Run<'_> {
             return Ok((first, angles));
         };
         self.command(tag, LedCommand::Play(flicker))?;
-        let noise = self.noise_from_below();
-        let mut seen: Fixations = [Vec::new(), Vec::new()];
-        let mut landmark = first;
-        let mut readings = self.run_up(&angles)?;
-        for round in 1..=self.config.reaims {
-            let goals = [0, 1].map(|k| Some(self.stepped(k, &angles[k], round)));
-            readings = self.system.turn(goals)?;
-            self.look_once(&first, &readings, &mut seen)?;
-            if round % BATCH == 0 && seen.iter().all(|s| s.len() >= BATCH) {
-                let [left, right] = &seen;
-                landmark = triangulate_many(&self.system.heads, [left, right], &noise)?.point;
-                if self.depth_sigma(&landmark) <= self.config.depth_sigma {
-                    break;
-                }
+        let mut readings = self.system.turn(reaim.run_up(slack).map(Some))?;
+        while let Some(goals) = reaim.next_aim()? {
+            readings = self.system.turn(goals.map(Some))?;
+            for (side, fixation) in self.look_once(&first, &readings)?.into_iter().enumerate() {
+                fixation.into_iter().for_each(|seen| reaim.add(side, seen));
             }
         }
-        let last = [0, 1].map(|k| self.last(k, &readings[k], &seen[k], &landmark.position, &noise));
+        let landmark = reaim.landmark()?.map_or(first, |landmark| landmark.point);
+        let last = [0, 1]
+            .map(|k| self.last(k, &readings[k], &reaim.seen()[k], &landmark.position, &noise));
         self.located(&landmark, &last);
         Ok((landmark, last.map(|fixation| fixation.angles)))
     }
 
-    /// Standard deviation of the distance from the middle of the heads (m).
-    fn depth_sigma(&self, landmark: &GaussianPoint) -> f64 {
-        let eyes =
-            [0, 1].map(|k| self.system.heads[k].base_from_optical([0.0; 2]).translation.vector);
-        let offset = landmark.position.coords - 0.5 * (eyes[0] + eyes[1]);
-        let along = offset / offset.norm().max(1e-9);
-        along.dot(&(landmark.covariance * along)).max(0.0).sqrt()
-    }
-
     /// Angle noise when every joint comes from below.
-    fn noise_from_below(&self) -> Noise {
+    pub(crate) fn noise_from_below(&self) -> Noise {
         let servos = self.system.robot.heads.iter().map(|head| &head.pan_tilt);
         let slack = servos.fold(0.0, |slack: f64, servo| slack.max(servo.backlash()));
         Noise { common_sigma: LAG.1 * slack, ..self.noise() }
-    }
-
-    /// Goes to below the first angles by more than the slack.
-    fn run_up(&mut self, angles: &[[f64; 2]; 2]) -> Result<[JointReading; 2], Stop> {
-        let below = [0, 1].map(|k| {
-            let servo = &self.system.robot.heads[k].pan_tilt;
-            let run_up = 1.5 * servo.backlash() + servo.resolution();
-            let start = self.stepped(k, &angles[k], 0);
-            Some(self.system.heads[k].clamp(start.map(|angle| angle - run_up)))
-        });
-        Ok(self.system.turn(below)?)
-    }
-
-    /// The angles of a round: one step upwards each, the light passing the image centre half way.
-    fn stepped(&self, side: usize, angles: &[f64; 2], round: usize) -> [f64; 2] {
-        let step = self.system.robot.heads[side].pan_tilt.resolution();
-        let offset = (round as f64 - 0.5 * self.config.reaims as f64) * step;
-        self.system.heads[side].clamp(angles.map(|angle| angle + offset))
     }
 
     /// Looks at the light with both cameras from where the heads stand; a camera that does not see
@@ -112,8 +80,7 @@ impl Run<'_> {
         &mut self,
         first: &GaussianPoint,
         readings: &[JointReading; 2],
-        seen: &mut Fixations,
-    ) -> Result<(), Stop> {
+    ) -> Result<[Option<Fixation>; 2], Stop> {
         let since = self.system.robot.clock.now();
         let mut frames: [Vec<Frame>; 2] = [Vec::new(), Vec::new()];
         for _ in 0..FRAMES {
@@ -124,22 +91,20 @@ impl Run<'_> {
             }
         }
         let sigma = self.noise().step_sigma.hypot(self.noise().common_sigma);
-        for side in 0..2 {
+        let seen = |side: usize| {
             let angles = self.camera_angles(side, &readings[side]);
             let head = &self.system.heads[side];
             // The first fixation and this one are off by a step's error each.
             let radius_px = 3.0 + 6.0 * sigma * head.camera.fx.max(head.camera.fy);
-            let Some(expected) = head.project(angles, &first.position) else { continue };
-            if let Some(spot) = near::locate(&frames[side], &expected, radius_px) {
-                let (pixel, pixel_covariance) = (spot.pixel, spot.covariance);
-                seen[side].push(Fixation { angles, pixel, pixel_covariance });
-            }
-        }
-        Ok(())
+            let expected = head.project(angles, &first.position)?;
+            let spot = near::locate(&frames[side], &expected, radius_px)?;
+            Some(Fixation { angles, pixel: spot.pixel, pixel_covariance: spot.covariance })
+        };
+        Ok([seen(0), seen(1)])
     }
 
     /// Where the camera is when the motor came from below.
-    pub(super) fn camera_angles(&self, side: usize, reading: &JointReading) -> [f64; 2] {
+    pub(crate) fn camera_angles(&self, side: usize, reading: &JointReading) -> [f64; 2] {
         let lag = LAG.0 * self.system.robot.heads[side].pan_tilt.backlash();
         [reading.pan - lag, reading.tilt - lag]
     }
@@ -166,7 +131,7 @@ impl Run<'_> {
 
 /// The angles, within `most` (rad) of the fixation's, at which a point is seen where the fixation saw
 /// it: Newton on the projection. `None` when there are none.
-fn settle(
+pub(crate) fn settle(
     head: &PanTiltHead,
     fixation: &Fixation,
     point: &Point3<f64>,
