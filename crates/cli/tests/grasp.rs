@@ -41,6 +41,10 @@ fn a_cup_is_found_grasped_and_lifted() {
     let save = path.with_file_name("saved");
     let (status, report) = grasp(&path, &["--save", save.to_str().unwrap()]);
     assert_eq!(status, Some(0), "{report}");
+    for name in ["1-edges", "2-field", "3-best", "5-residuals"] {
+        let picture = save.join(format!("directional-view1-{name}.png"));
+        vergence_imaging::codec::read(&picture).unwrap();
+    }
     let grasp = &report["grasp"];
     assert_eq!(grasp["succeeded"], true, "{grasp}");
     assert_eq!(grasp["verified"], true, "the heads saw the landmark rise: {grasp}");

@@ -52,7 +52,8 @@ pub fn run(args: &Find) -> Result<bool, Failure> {
     let mut robot = args.robot.open()?;
     let config =
         FindConfig { method: args.method.into(), seed: args.robot.seed, ..FindConfig::default() };
-    let saver = args.save.as_deref().map(|dir| Saver::create(dir, &robot)).transpose()?;
+    let saver =
+        args.save.as_deref().map(|dir| Saver::create(dir, &robot, config.method)).transpose()?;
     let mut observer = (Progress::steps(), saver);
     let mut report = vergence::find(&mut robot.system, &args.object, &config, &mut observer);
     report.truth = robot.truth(&args.object);

@@ -31,7 +31,11 @@ pub fn run(args: &Grasp) -> Result<bool, Failure> {
     robot.attach_arm(&args.object, args.save.is_some())?;
     let find = FindConfig { seed: args.robot.seed, ..FindConfig::default() };
     let config = GraspConfig { find, ..GraspConfig::default() };
-    let saver = args.save.as_deref().map(|dir| Saver::create(dir, &robot)).transpose()?;
+    let saver = args
+        .save
+        .as_deref()
+        .map(|dir| Saver::create(dir, &robot, config.find.method))
+        .transpose()?;
     let mut observer = (Progress::steps(), saver);
     let truth = robot.truth(&args.object);
     let mut report = vergence::grasp(&mut robot.system, &args.object, &config, &mut observer);

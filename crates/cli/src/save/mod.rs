@@ -7,6 +7,8 @@
 //! 4-edges-{left,right}.png        edges of the pictures with the light off
 //! 5-field-{left,right}.png        their distance transform
 //! 6-template-{left,right}.png     the template, hidden lines removed, over the picture
+//! directional-view{0,1}-*.png     what the default method saw: oriented edges, fields, best and
+//!                                 second-best pose, residuals
 //! recording.mcap                  images, camera info, joints, tf and the result for ROS 2 tools
 //! result.json                     what --json prints
 //! ```
@@ -18,10 +20,11 @@ mod recorder;
 use std::path::{Path, PathBuf};
 
 use nalgebra::Point2;
-use vergence::{Event, Observer, Report};
+use vergence::{Event, Method, Observer, Report};
 use vergence_devices::Side;
 use vergence_imaging::canvas::{Canvas, colour};
 use vergence_imaging::{CodecError, Frame, codec};
+use vergence_pose::directional;
 
 use crate::failure::Failure;
 use crate::robot::Opened;
@@ -35,6 +38,8 @@ const MOST_FRAMES: usize = 400;
 pub struct Saver {
     dir: PathBuf,
     recorder: Recorder,
+    /// How the object is recognised.
+    method: Method,
     /// The newest frames.
     newest: [Option<Frame>; 2],
     /// Frames of the watch that is going on, by side.
@@ -45,12 +50,13 @@ pub struct Saver {
 
 impl Saver {
     /// Makes the folder and opens the recording in it.
-    pub fn create(dir: &Path, robot: &Opened) -> Result<Self, Failure> {
+    pub fn create(dir: &Path, robot: &Opened, method: Method) -> Result<Self, Failure> {
         std::fs::create_dir_all(dir).map_err(|error| cannot_write(dir, error))?;
         let recorder = Recorder::create(&dir.join("recording.mcap"), robot)?;
         Ok(Saver {
             dir: dir.into(),
             recorder,
+            method,
             newest: [None, None],
             watched: Default::default(),
             failed: None,
@@ -73,7 +79,11 @@ impl Saver {
     }
 
     fn picture(&mut self, name: &str, side: Side, canvas: &Canvas) {
-        let path = self.dir.join(format!("{name}-{}.png", side.name()));
+        self.write(&format!("{name}-{}", side.name()), canvas);
+    }
+
+    fn write(&mut self, name: &str, canvas: &Canvas) {
+        let path = self.dir.join(format!("{name}.png"));
         let written = codec::write_canvas(&path, canvas).map_err(unwritten);
         self.keep(written);
     }
@@ -121,6 +131,15 @@ impl Saver {
                     self.picture("4-edges", side, &pictures.edges);
                     self.picture("5-field", side, &pictures.field);
                     self.picture("6-template", side, &pictures.template);
+                }
+                // The recognition runs once more: only that keeps what it saw on its way.
+                if self.method == Method::Directional
+                    && let Ok((_, trace)) =
+                        directional::recognise_traced(views, query, &Default::default())
+                {
+                    for (name, canvas) in directional::picture::draw(&trace) {
+                        self.write(&format!("directional-{name}"), &canvas);
+                    }
                 }
             }
             _ => {}

@@ -87,7 +87,8 @@ fn grasp(args: &Experiment, seed: u64) -> Result<Run, Failure> {
     let find = FindConfig { seed, ..FindConfig::default() };
     let config = GraspConfig { find, ..GraspConfig::default() };
     let dir = args.save.as_ref().map(|dir| dir.join(format!("{seed:03}")));
-    let mut saver = dir.as_ref().map(|dir| Saver::create(dir, &robot)).transpose()?;
+    let mut saver =
+        dir.as_ref().map(|dir| Saver::create(dir, &robot, config.find.method)).transpose()?;
     let truth = robot.truth(OBJECT);
     let mut report = vergence::grasp(&mut robot.system, OBJECT, &config, &mut saver);
     report.truth = truth;

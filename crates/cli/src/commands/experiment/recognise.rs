@@ -110,7 +110,8 @@ fn find(args: &Experiment, condition: &Condition, seed: u64) -> Result<Outcome, 
     let save = args.save.as_ref().filter(|_| seed == 1);
     let mut saver = save
         .map(|dir| {
-            Saver::create(&dir.join(condition.name.replace(", ", "-").replace(' ', "-")), &robot)
+            let name = condition.name.replace(", ", "-").replace(' ', "-");
+            Saver::create(&dir.join(name), &robot, config.method)
         })
         .transpose()?;
     let mut report = vergence::find(&mut robot.system, condition.object, &config, &mut saver);
