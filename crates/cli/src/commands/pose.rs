@@ -70,11 +70,7 @@ pub struct Outcome {
 /// Runs the command; `true` when at least one scene was answered.
 pub fn run(args: PoseArgs) -> Result<bool, Failure> {
     let folders = set::scenes(&args.set)?;
-    let pool = rayon::ThreadPoolBuilder::new()
-        .num_threads(args.threads.max(1))
-        .build()
-        .map_err(|e| Failure::failed(e, "ask for fewer --threads"))?;
-    let outcomes: Result<Vec<Outcome>, Failure> = pool.install(|| {
+    let outcomes: Result<Vec<Outcome>, Failure> = pool(args.threads)?.install(|| {
         use rayon::prelude::*;
         folders.par_iter().map(|(id, folder)| recognise(*id, folder, &args)).collect()
     });
@@ -82,6 +78,12 @@ pub fn run(args: PoseArgs) -> Result<bool, Failure> {
     table::write(&args.out, &outcomes)?;
     table::summary(&outcomes, &args.out);
     Ok(outcomes.iter().any(|o| o.result.is_ok()))
+}
+
+/// Threads for as many scenes at a time; at least one.
+pub fn pool(threads: usize) -> Result<rayon::ThreadPool, Failure> {
+    let builder = rayon::ThreadPoolBuilder::new().num_threads(threads.max(1));
+    builder.build().map_err(|e| Failure::failed(e, "ask for fewer --threads"))
 }
 
 fn recognise(id: u32, folder: &Path, args: &PoseArgs) -> Result<Outcome, Failure> {

@@ -4,8 +4,8 @@
 //! the picture was taken on our clock, and its running number with those counted that were lost.
 //!
 //! Method: the smallest arrival delay of the last seconds is taken for the transport's constant part,
-//! so a stamp is late by that part but even; the caller takes off what it knows of it. The median step between two stamps tells how many
-//! pictures a longer step lost. Promise: stamps and numbers grow strictly while arrivals do.
+//! so a stamp is late by that part but even; the caller takes off what it knows of it. The median step
+//! between two stamps tells how many pictures a longer step lost. Promise: stamps and numbers grow strictly while arrivals do.
 
 use std::collections::VecDeque;
 use std::time::Duration;

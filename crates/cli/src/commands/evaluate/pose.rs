@@ -14,7 +14,7 @@ use vergence_geometry::Symmetry;
 use vergence_pose::{ObjectPose, Query, Refusal, View};
 use vergence_sim::{Scenario, StereoScene, stereo_scene};
 
-use crate::commands::pose::Method;
+use crate::commands::pose::{Method, pool};
 use crate::failure::Failure;
 
 /// Recognise objects in simulated stereo pairs and compare with the truth.
@@ -60,12 +60,8 @@ pub fn run(args: &Pose) -> Result<bool, Failure> {
         let what = format!("--scenes {} is not between 1 and 100000", args.scenes);
         return Err(Failure::misuse(what, "give a number in that range"));
     }
-    let pool = rayon::ThreadPoolBuilder::new()
-        .num_threads(args.threads.max(1))
-        .build()
-        .map_err(|e| Failure::failed(e, "ask for fewer --threads"))?;
     let seeds = args.seed..args.seed.saturating_add(args.scenes);
-    let outcomes: Result<Vec<(Outcome, f64)>, Failure> = pool.install(|| {
+    let outcomes: Result<Vec<(Outcome, f64)>, Failure> = pool(args.threads)?.install(|| {
         use rayon::prelude::*;
         seeds.into_par_iter().map(|seed| recognise(seed, args.method)).collect()
     });
