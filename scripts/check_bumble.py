@@ -47,10 +47,10 @@ class Passkey(PairingDelegate):
         return self.passkey
 
 
-def check(what, good):
+def check(what, good, said=""):
     print(f"{'ok  ' if good else 'FAIL'} {what}")
     if not good:
-        raise SystemExit(1)
+        raise SystemExit(said or 1)
 
 
 async def scan(device):
@@ -199,15 +199,15 @@ async def foreign_radio(folder):
         address = re.search(r"tag ([0-9A-F:]{17})", hello).group(1)
         # bumble delivers no scan responses, so that the tag goes by its address.
         status, said = await vergence(folder, "tag", "info", address)
-        check("our robot meets our tag", status == 0 and "Linux board" in said)
-        check("unpaired, the record is refused", "not for this robot" in said)
+        check("our robot meets our tag", status == 0 and "Linux board" in said, said)
+        check("unpaired, the record is refused", "not for this robot" in said, said)
         wrong = await vergence(folder, "tag", "pair", address, "--passkey", "000001")
-        check("a wrong passkey is refused", wrong[0] == 1 and "pairing failed" in wrong[1])
+        check("a wrong passkey is refused", wrong[0] == 1 and "pairing failed" in wrong[1], wrong[1])
         await asyncio.sleep(2.5)
         paired = await vergence(folder, "tag", "pair", address, "--passkey", str(PASSKEY))
-        check("paired by passkey", paired[0] == 0)
+        check("paired by passkey", paired[0] == 0, paired[1])
         status, said = await vergence(folder, "tag", "info", address)
-        check("encrypted record read with the kept bond", status == 0 and "yes, not signed" in said)
+        check("encrypted record read with the kept bond", status == 0 and "yes, not signed" in said, said)
         blink = asyncio.create_task(
             vergence(folder, "tag", "blink", address, "--pattern", "10", "--seconds", "1")
         )
@@ -217,9 +217,9 @@ async def foreign_radio(folder):
             await asyncio.sleep(0.01)
         check("commanded, and its LED blinks", (await blink)[0] == 0 and {"0", "255"} <= levels)
         written = await vergence(folder, "tag", "write", str(folder / "mug.toml"), "--to", address)
-        check("a new record is written", written[0] == 0)
+        check("a new record is written", written[0] == 0, written[1])
         status, said = await vergence(folder, "tag", "info", address)
-        check("and the tag serves it", status == 0 and "yes, not signed" in said)
+        check("and the tag serves it", status == 0 and "yes, not signed" in said, said)
     finally:
         tag.kill()
         await tag.wait()

@@ -8,6 +8,9 @@
 //! list whose end does not lie where it says.
 //!
 //! A dropped request gets no answer; well-behaved peers do not send such.
+//!
+//! What a peer sends as soon as it has connected waits until the firmware was told of the link: a tag
+//! that is slow for a moment would answer a pairing before it has said that it keeps bonds.
 
 use core::cell::{Cell, RefCell};
 
@@ -17,6 +20,7 @@ use bt_hci::controller::{Controller, ControllerCmdAsync, ControllerCmdSync};
 use bt_hci::data::{AclBroadcastFlag, AclPacket, AclPacketBoundary, IsoPacket, SyncPacket};
 use bt_hci::event::{EventKind, EventPacket};
 use bt_hci::param::ConnHandle;
+use embassy_futures::yield_now;
 use embedded_io::ErrorType;
 
 use crate::frame::well_formed;
@@ -26,6 +30,9 @@ pub const FRAME: usize = 251;
 /// Longest event.
 const EVENT: usize = 255;
 const NO_LINK: u16 = u16::MAX;
+/// Subevents of a completed connection: plain, enhanced, enhanced of version 2 (Core 5.4 Vol 4, Part E,
+/// 7.7.65).
+const CONNECTED: [u8; 3] = [0x01, 0x0A, 0x29];
 
 /// A frame that is being put together.
 struct Partial {
@@ -39,13 +46,16 @@ pub struct Guard<C, const LINKS: usize> {
     inner: C,
     partial: RefCell<[Partial; LINKS]>,
     dropped: Cell<u32>,
+    /// The last event told of a new link.
+    connected: Cell<bool>,
 }
 
 impl<C, const LINKS: usize> Guard<C, LINKS> {
     /// Stands before a controller.
     pub fn new(inner: C) -> Self {
         const EMPTY: Partial = Partial { handle: NO_LINK, have: 0, data: [0; FRAME] };
-        Guard { inner, partial: RefCell::new([EMPTY; LINKS]), dropped: Cell::new(0) }
+        let partial = RefCell::new([EMPTY; LINKS]);
+        Guard { inner, partial, dropped: Cell::new(0), connected: Cell::new(false) }
     }
 
     /// How many frames were dropped so far.
@@ -103,6 +113,12 @@ impl<C, const LINKS: usize> Guard<C, LINKS> {
         None
     }
 
+    /// Notes a new link.
+    fn note(&self, event: &EventPacket<'_>) {
+        let subevent = event.data.first().is_some_and(|code| CONNECTED.contains(code));
+        self.connected.set(event.kind == EventKind::Le && subevent);
+    }
+
     /// Forgets what a link that ended had left unfinished.
     fn forget(&self, event: &EventPacket<'_>) {
         let [_, low, high, ..] = event.data else { return };
@@ -156,6 +172,9 @@ impl<C: Controller, const LINKS: usize> Controller for Guard<C, LINKS> {
         &self,
         buf: &'a mut Self::Buffer<'_>,
     ) -> Result<ControllerToHostPacket<'a>, Self::Error> {
+        if self.connected.take() {
+            yield_now().await;
+        }
         let found = loop {
             match self.inner.read(&mut buf.inner).await? {
                 ControllerToHostPacket::Acl(packet) => {
@@ -165,6 +184,7 @@ impl<C: Controller, const LINKS: usize> Controller for Guard<C, LINKS> {
                 }
                 ControllerToHostPacket::Event(event) => {
                     self.forget(&event);
+                    self.note(&event);
                     let length = event.data.len().min(EVENT);
                     buf.out[..length].copy_from_slice(&event.data[..length]);
                     break Found::Event(event.kind, length);
@@ -205,6 +225,9 @@ impl<Q: AsyncCmd, C: ControllerCmdAsync<Q>, const LINKS: usize> ControllerCmdAsy
 
 #[cfg(test)]
 mod tests {
+    use core::pin::pin;
+    use core::task::{Context, Waker};
+
     use super::*;
 
     fn feed(guard: &Guard<(), 2>, handle: u16, first: bool, data: &[u8]) -> Option<usize> {
@@ -237,5 +260,46 @@ mod tests {
         assert_eq!(feed(&guard, 1, false, &[0; 248]), None, "longer than any frame");
         assert_eq!(guard.dropped(), 4);
         assert_eq!(feed(&guard, 1, true, &[3, 0, 4, 0, 0x0A, 1, 0]), Some(7), "and recovers");
+    }
+
+    /// Has everything ready at once: event after event of completed connections.
+    struct Busy;
+
+    impl ErrorType for Busy {
+        type Error = core::convert::Infallible;
+    }
+
+    impl Controller for Busy {
+        type Buffer<'a> = [u8; 0];
+
+        fn alloc_buf(&self) -> Result<[u8; 0], Self::Error> {
+            Ok([])
+        }
+        async fn write_acl_data(&self, _: &AclPacket<'_>) -> Result<(), Self::Error> {
+            Ok(())
+        }
+        async fn write_sync_data(&self, _: &SyncPacket<'_>) -> Result<(), Self::Error> {
+            Ok(())
+        }
+        async fn write_iso_data(&self, _: &IsoPacket<'_>) -> Result<(), Self::Error> {
+            Ok(())
+        }
+        async fn read<'a>(
+            &self,
+            _: &'a mut Self::Buffer<'_>,
+        ) -> Result<ControllerToHostPacket<'a>, Self::Error> {
+            Ok(ControllerToHostPacket::Event(EventPacket { kind: EventKind::Le, data: &[0x01] }))
+        }
+    }
+
+    #[test]
+    fn the_firmware_hears_of_a_link_before_what_comes_over_it() {
+        let guard = Guard::<Busy, 1>::new(Busy);
+        let Ok(mut buffer) = guard.alloc_buf();
+        let mut context = Context::from_waker(Waker::noop());
+        assert!(pin!(guard.read(&mut buffer)).poll(&mut context).is_ready(), "of the link");
+        let mut next = pin!(guard.read(&mut buffer));
+        assert!(next.as_mut().poll(&mut context).is_pending(), "the firmware's turn");
+        assert!(next.poll(&mut context).is_ready(), "and then the rest");
     }
 }

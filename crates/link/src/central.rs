@@ -222,12 +222,16 @@ impl<'a, C: Controller + ControllerCmdSync<LeSetScanParams>> Central<'a, '_, C> 
     async fn attempt(&self, tag: TagAddress, task: &Task) -> Outcome {
         let connection = self.connect(tag).await?;
         if let Task::Pair(passkey) = task {
-            let outcome = self.pair(&connection, *passkey).await;
+            let mut outcome = self.pair(&connection, *passkey).await;
+            if outcome.is_ok() {
+                // The robot's last key may still be on its way, and the end of the link would overtake
+                // it: the tag would have no bond. A request cannot, so that its answer is the proof.
+                outcome = self.hold(&connection, tag, &Task::Info).await.and(outcome);
+            }
             self.close(&connection).await;
             return outcome;
         }
-        let outcome =
-            conversation::hold(self.stack, &connection, self.ears, &self.handles, tag, task).await;
+        let outcome = self.hold(&connection, tag, task).await;
         let plays = matches!(task, Task::Command(Command::Play { .. })) && outcome.is_ok();
         if plays && connection.is_connected() {
             self.held.borrow_mut().push(Held { tag, connection });
@@ -235,6 +239,15 @@ impl<'a, C: Controller + ControllerCmdSync<LeSetScanParams>> Central<'a, '_, C> 
             self.close(&connection).await;
         }
         outcome
+    }
+
+    async fn hold(
+        &self,
+        connection: &Connection<'a, HeapPool>,
+        tag: TagAddress,
+        task: &Task,
+    ) -> Outcome {
+        conversation::hold(self.stack, connection, self.ears, &self.handles, tag, task).await
     }
 
     async fn pair(&self, connection: &Connection<'a, HeapPool>, passkey: Option<u32>) -> Outcome {
