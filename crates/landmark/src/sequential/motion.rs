@@ -5,7 +5,9 @@
 //! brightness of a row is the median over its pixels; in the fit, pixels that differ far from what the
 //! motion explains (people, things, screens, tags) count nothing (Tukey's biweight).
 
+use std::array::from_fn;
 use std::borrow::Cow;
+use std::ops::Range;
 
 use vergence_imaging::Image;
 
@@ -13,6 +15,8 @@ use super::shift::shifted;
 
 /// Independent partial sums: they vectorise, and always add up in the same order.
 const LANES: usize = 8;
+
+type Lanes = [f32; LANES];
 
 /// Residuals (grey levels) at which a pixel counts nothing: wide while the motion is unknown, narrow
 /// in the end.
@@ -151,37 +155,50 @@ fn brightness(reference: &[f32], row: &[f32], ratios: &mut Vec<f32>) -> f32 {
 }
 
 /// Weighted sums over one row: weight; slope x, slope y, residual; products xx, xy, yy, xr, yr, rr.
+///
+/// One short loop of constant length for every quantity: only so does the compiler vectorise them.
 #[multiversion::multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
 fn accumulate([above, here, below]: [&[f32]; 3], frame: &[f32], gain: f32, cut: f32) -> [f32; 10] {
     let n = here.len();
-    let (above, below, frame) = (&above[..n], &below[..n], &frame[..n]);
+    let lanes = |row, from| lanes(row, from..n - 2 + from);
     let scale = 1.0 / (cut * cut);
-    let mut lanes = [[0.0f32; LANES]; 10];
-    let mut x = 1;
-    while x + LANES < n {
-        let (left, right) = (&here[x - 1..x - 1 + LANES], &here[x + 1..x + 1 + LANES]);
-        let (b, up, down) = (&here[x..x + LANES], &above[x..x + LANES], &below[x..x + LANES]);
-        let f = &frame[x..x + LANES];
-        for k in 0..LANES {
-            let (gx, gy) = (0.5 * (right[k] - left[k]), 0.5 * (down[k] - up[k]));
-            let r = f[k] - gain * b[k];
-            let near = (1.0 - r * r * scale).max(0.0);
-            let weight = near * near;
-            let (wx, wy) = (weight * gx, weight * gy);
-            lanes[0][k] += weight;
-            lanes[1][k] += wx;
-            lanes[2][k] += wy;
-            lanes[3][k] += weight * r;
-            lanes[4][k] += wx * gx;
-            lanes[5][k] += wx * gy;
-            lanes[6][k] += wy * gy;
-            lanes[7][k] += wx * r;
-            lanes[8][k] += wy * r;
-            lanes[9][k] += weight * r * r;
-        }
-        x += LANES;
+    let mut sums = [[0.0f32; LANES]; 10];
+    let along = lanes(here, 0).zip(lanes(here, 1)).zip(lanes(here, 2));
+    let across = lanes(above, 1).zip(lanes(below, 1)).zip(lanes(frame, 1));
+    for (((left, b), right), ((up, down), f)) in along.zip(across) {
+        let gx: Lanes = from_fn(|k| 0.5 * (right[k] - left[k]));
+        let gy: Lanes = from_fn(|k| 0.5 * (down[k] - up[k]));
+        let r: Lanes = from_fn(|k| f[k] - gain * b[k]);
+        let near: Lanes = from_fn(|k| (1.0 - r[k] * r[k] * scale).max(0.0));
+        let weight = product(&near, &near);
+        let (wx, wy, wr) = (product(&weight, &gx), product(&weight, &gy), product(&weight, &r));
+        add(&mut sums[0], &weight);
+        add(&mut sums[1], &wx);
+        add(&mut sums[2], &wy);
+        add(&mut sums[3], &wr);
+        add(&mut sums[4], &product(&wx, &gx));
+        add(&mut sums[5], &product(&wx, &gy));
+        add(&mut sums[6], &product(&wy, &gy));
+        add(&mut sums[7], &product(&wx, &r));
+        add(&mut sums[8], &product(&wy, &r));
+        add(&mut sums[9], &product(&wr, &r));
     }
-    lanes.map(|lane| lane.iter().sum())
+    sums.map(|lane| lane.iter().sum())
+}
+
+#[inline(always)]
+fn product(a: &Lanes, b: &Lanes) -> Lanes {
+    from_fn(|k| a[k] * b[k])
+}
+
+#[inline(always)]
+fn add(sum: &mut Lanes, term: &Lanes) {
+    *sum = from_fn(|k| sum[k] + term[k]);
+}
+
+/// A part of a row in pieces of constant length.
+fn lanes(row: &[f32], part: Range<usize>) -> impl Iterator<Item = &Lanes> {
+    row[part].as_chunks().0.iter()
 }
 
 /// Adds a row to the normal equations (xx, xy, yy, xr, yr, rr, weight), its own offset
