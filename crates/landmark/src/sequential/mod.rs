@@ -21,6 +21,7 @@ pub mod evidence;
 pub mod explain;
 pub mod front;
 pub mod history;
+mod median;
 pub mod motion;
 pub mod nuisance;
 pub mod places;
@@ -99,7 +100,7 @@ pub struct SequentialFinder {
     reference: Reference,
     variation: Option<Variation>,
     history: History,
-    /// Memory of the picture that left the window last.
+    /// Memory for the next filtered picture.
     spare: Option<Image<i16>>,
     noise: BlockNoise,
     lamps: Lamps,
@@ -229,11 +230,16 @@ fn families(requests: &[Request]) -> Vec<Vec<usize>> {
 }
 
 /// Registers and filters a frame.
-fn past(reference: &mut Reference, frame: &Frame, time: f64, reuse: Option<Image<i16>>) -> Past {
+fn past(
+    reference: &mut Reference,
+    frame: &Frame,
+    time: f64,
+    reuse: Option<Image<i16>>,
+) -> (Past, Image<i16>) {
     let mut placement = reference.place(&frame.image);
     placement.row_gain = nuisance::smoothed(&placement.row_gain);
     let filtered = still(front::filter(&frame.image, reuse), &placement);
-    Past { time, exposure: frame.exposure.as_secs_f64(), placement, filtered }
+    (Past { time, exposure: frame.exposure.as_secs_f64(), placement }, filtered)
 }
 
 /// The filtered frame, moved back to where the first frame lay.
@@ -248,12 +254,13 @@ impl Finder for SequentialFinder {
     fn push(&mut self, frame: &Frame) -> Result<(), FinderError> {
         let time = self.sequence.accept(frame)?;
         self.size = (frame.image.width(), frame.image.height());
-        let past = past(&mut self.reference, frame, time, self.spare.take());
+        let (past, filtered) = past(&mut self.reference, frame, time, self.spare.take());
         let pixels = self.size.0 * self.size.1;
         let window = self.config.window_frames;
         let variation = self.variation.get_or_insert_with(|| Variation::new(pixels, window));
-        variation.push(past.filtered.data());
-        self.spare = self.history.push(past);
+        variation.push(filtered.data());
+        self.history.push(past, &filtered);
+        self.spare = Some(filtered);
         self.frames += 1;
         if self.frames >= FIRST_FRAMES {
             let scan = self.frames >= self.next_scan;

@@ -11,6 +11,7 @@ use std::ops::Range;
 
 use super::front::{GAIN, NOISE_GAIN};
 use super::history::History;
+use super::median::median;
 use super::nuisance::{Nuisance, dot_columns, squares_of_columns};
 
 /// Side of a block (px).
@@ -53,9 +54,8 @@ impl BlockNoise {
                 // Neighbours see the same noise; every second pixel says nearly as much as all.
                 values.extend(row.iter().skip(y / 2 % 2).step_by(2));
             }
-            let middle = values.len() / 2;
-            let median = *values.select_nth_unstable_by(middle, f32::total_cmp).1;
-            variance.push((median / frames.saturating_sub(1).max(1) as f32).max(LEAST_VARIANCE));
+            let energy = median(&values);
+            variance.push((energy / frames.saturating_sub(1).max(1) as f32).max(LEAST_VARIANCE));
         }
         BlockNoise { across, variance }
     }
