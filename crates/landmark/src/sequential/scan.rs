@@ -29,6 +29,9 @@ pub const BY_ENERGY: usize = 48;
 /// Distance from the border (px) within which nothing is looked for.
 pub const MARGIN: usize = 4;
 
+/// Pixels, over all frames of the window, that a scan reads at one frame.
+const STEP: usize = 8 * 640 * 480;
+
 /// Variance that rounding to grey levels alone leaves (filter units squared).
 const LEAST_VARIANCE: f32 = NOISE_GAIN * NOISE_GAIN / 12.0;
 
@@ -172,28 +175,78 @@ pub struct Family {
     pub lines: Vec<Vec<f32>>,
 }
 
-/// Tests the varying pixels for the lines of every family; the best places of each.
-///
-/// `presence`: log likelihood ratio of a light that is decided.
-pub fn by_lines(
-    history: &History,
-    energy: &[f32],
-    (width, height): (usize, usize),
-    noise: &BlockNoise,
-    nuisance: &Nuisance,
-    families: &[Family],
-    presence: f64,
-) -> Vec<Candidate> {
+/// A scan of the whole picture, some rows of it at every frame.
+#[derive(Debug, Clone)]
+pub struct Sweep {
+    /// The best places so far of every family.
+    best: Vec<Best>,
+    /// The rows that are still to be looked at.
+    rows: Range<usize>,
+}
+
+impl Sweep {
+    /// Frames over which a scan of a window of so many frames is spread.
+    pub fn frames((width, height): (usize, usize), window: usize) -> usize {
+        (width * height * window).div_ceil(STEP)
+    }
+
+    /// A scan that has not begun; `families`: the number of requests of each.
+    pub fn new(height: usize, families: impl Iterator<Item = usize>) -> Self {
+        Sweep { best: families.map(Best::of).collect(), rows: MARGIN..height - MARGIN }
+    }
+
+    /// Looks at the next rows, as many as make `steps` steps of the picture; all that are left when it
+    /// is one. The best places of every family once all rows have been looked at.
+    pub fn step(
+        &mut self,
+        view: &View,
+        families: &[Family],
+        steps: usize,
+    ) -> Option<Vec<Candidate>> {
+        let from = self.rows.start;
+        self.rows.start = (from + view.size.1.div_ceil(steps)).min(self.rows.end);
+        by_lines(view, families, from..self.rows.start, &mut self.best);
+        if !self.rows.is_empty() {
+            return None;
+        }
+        let mut candidates = Vec::new();
+        for (family, best) in families.iter().zip(&mut self.best) {
+            let candidate = |(_, pixel)| Candidate { pixel, requests: family.requests.clone() };
+            candidates.extend(best.list.drain(..).map(candidate));
+        }
+        Some(candidates)
+    }
+}
+
+/// What a scan looks at.
+pub struct View<'a> {
+    /// The window.
+    pub history: &'a History,
+    /// Columns and rows.
+    pub size: (usize, usize),
+    /// Energy of every pixel.
+    pub energy: &'a [f32],
+    /// Noise of every block.
+    pub noise: &'a BlockNoise,
+    /// What else changes.
+    pub nuisance: &'a Nuisance,
+    /// Log likelihood ratio of a light that is decided.
+    pub presence: f64,
+}
+
+/// Tests the varying pixels of some rows for the lines of every family; adds to the best places of each.
+fn by_lines(view: &View, families: &[Family], rows: Range<usize>, best: &mut [Best]) {
+    let View { history, energy, noise, nuisance, .. } = *view;
+    let width = view.size.0;
     let n = history.len();
-    let limit = chi_square(n, least_excess(n, presence));
-    let mut best: Vec<Best> = families.iter().map(|f| Best::of(f.requests.len())).collect();
+    let limit = chi_square(n, least_excess(n, view.presence));
     let vectors = families.iter().flat_map(|f| &f.lines).chain(nuisance.basis());
     let vectors: Vec<&[f32]> = vectors.map(Vec::as_slice).collect();
     let (mut series, mut columns) = (Vec::new(), Vec::with_capacity(width / 2));
     let (mut shares, mut totals) = (Vec::new(), Vec::new());
     let mut limits = vec![0.0; width];
-    for y in MARGIN..height - MARGIN {
-        if y == MARGIN || y % BLOCK == 0 {
+    for y in rows.clone() {
+        if y == rows.start || y % BLOCK == 0 {
             noise.along(y, limit, &mut limits);
         }
         columns.clear();
@@ -216,7 +269,7 @@ pub fn by_lines(
             let taken = shares[lines * count..].iter().skip(k).step_by(count);
             let total = totals[k] - taken.sum::<f32>() + 40.0 * noise.at(x, y) as f32;
             let mut from = 0;
-            for (family, best) in families.iter().zip(&mut best) {
+            for (family, best) in families.iter().zip(&mut *best) {
                 let to = from + family.lines.len();
                 let own = shares[from * count..to * count].iter().skip(k).step_by(count);
                 let explained = own.sum::<f32>();
@@ -228,13 +281,6 @@ pub fn by_lines(
             }
         }
     }
-    let mut candidates = Vec::new();
-    for (family, best) in families.iter().zip(best) {
-        let requests = &family.requests;
-        let candidate = |(_, pixel)| Candidate { pixel, requests: requests.clone() };
-        candidates.extend(best.list.into_iter().map(candidate));
-    }
-    candidates
 }
 
 /// By how many standard deviations of chance the energy of a light exceeds the noise when its evidence
@@ -247,6 +293,7 @@ fn least_excess(frames: usize, presence: f64) -> f32 {
 }
 
 /// A list of the best places, no two of them neighbours, best first.
+#[derive(Debug, Clone)]
 struct Best {
     list: Vec<(f32, (usize, usize))>,
     most: usize,
