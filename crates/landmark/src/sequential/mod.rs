@@ -201,7 +201,8 @@ impl SequentialFinder {
                 self.places.add(pixel, 0..self.requests.len());
             }
         }
-        if !scanned && !self.places.any_due(self.frames) {
+        let before_next_turn = self.frames + verdict::turns(self.requests.len()) - 1;
+        if !scanned && !self.places.any_due(before_next_turn) {
             return;
         }
         let known =
