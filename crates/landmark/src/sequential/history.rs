@@ -168,11 +168,13 @@ impl History {
     /// Change of brightness since the first frame of the window for many pixels of one row, frame by
     /// frame for all pixels: memory is read and written in the order in which it lies.
     pub fn changes_of_row(&self, y: usize, columns: &[usize], out: &mut Vec<f32>) {
-        out.clear();
+        out.resize(columns.len() * self.len(), 0.0);
         let Some(first) = self.row(y).next() else { return };
-        for row in self.row(y) {
-            let change = |&x: &usize| f32::from(row[x].wrapping_sub(first[x])) * (1.0 / GAIN);
-            out.extend(columns.iter().map(change));
+        let first: Vec<i16> = columns.iter().map(|&x| first[x]).collect();
+        for (row, out) in self.row(y).zip(out.chunks_exact_mut(columns.len().max(1))) {
+            for ((change, &x), first) in out.iter_mut().zip(columns).zip(&first) {
+                *change = f32::from(row[x].wrapping_sub(*first)) * (1.0 / GAIN);
+            }
         }
     }
 }

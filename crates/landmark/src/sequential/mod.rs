@@ -283,7 +283,11 @@ fn still(filtered: Image<i16>, placement: &Placement) -> Image<i16> {
     if placement.dx.hypot(placement.dy) < STILL_PX {
         return filtered;
     }
-    shift::shifted(&filtered, placement.dx, placement.dy).map(shift::rounded)
+    let mut moved = Image::filled(filtered.width(), filtered.height(), 0);
+    shift::shift_rows(&filtered, placement.dx, placement.dy, |y, row| {
+        shift::round(moved.row_mut(y), row);
+    });
+    moved
 }
 
 impl Finder for SequentialFinder {
