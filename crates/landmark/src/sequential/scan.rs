@@ -5,7 +5,8 @@
 //! neighbours, about one in nine, and not much less than a light would that is nearly decided, are
 //! tested for the lines of the patterns; patterns of one length and chip have the same lines and are
 //! tested at once. The best few places go on. Choosing by rank, not by a threshold on the evidence,
-//! keeps the cost constant and needs no noise model.
+//! keeps the cost constant and needs no noise model. A scan is spread over frames, as no single one may
+//! take long.
 
 use std::ops::Range;
 
@@ -29,8 +30,12 @@ pub const BY_ENERGY: usize = 48;
 /// Distance from the border (px) within which nothing is looked for.
 pub const MARGIN: usize = 4;
 
-/// Pixels, over all frames of the window, that a scan reads at one frame.
-const STEP: usize = 8 * 640 * 480;
+/// Pixels, over all frames of the window, that a scan reads at one frame; more of a large picture, so
+/// that it takes no longer than an eighth of the window.
+const STEP: usize = LEAST_FRAMES * 640 * 480;
+
+/// Frames that a scan reads of a large picture at one frame.
+const LEAST_FRAMES: usize = 8;
 
 /// Variance that rounding to grey levels alone leaves (filter units squared).
 const LEAST_VARIANCE: f32 = NOISE_GAIN * NOISE_GAIN / 12.0;
@@ -187,7 +192,7 @@ pub struct Sweep {
 impl Sweep {
     /// Frames over which a scan of a window of so many frames is spread.
     pub fn frames((width, height): (usize, usize), window: usize) -> usize {
-        (width * height * window).div_ceil(STEP)
+        (width * height * window).div_ceil(STEP).min(window.div_ceil(LEAST_FRAMES))
     }
 
     /// A scan that has not begun; `families`: the number of requests of each.
@@ -333,4 +338,47 @@ fn peaks(energy: &[f32], width: usize, y: usize, limits: &[f32], columns: &mut V
         let e = here[x];
         e > limits[x] && e >= here[x - 1] && e > here[x + 1] && is_peak([above, here, below], x)
     }));
+}
+
+#[cfg(test)]
+mod tests {
+    use vergence_imaging::Image;
+
+    use super::super::front::Variation;
+    use super::super::history::Past;
+    use super::super::motion::Placement;
+    use super::super::nuisance::Lamps;
+    use super::*;
+
+    #[test]
+    fn a_scan_in_steps_finds_what_one_at_once_finds() {
+        let size = (48, 40);
+        let (mut history, mut variation) = (History::new(16), Variation::new(48 * 40, 16));
+        for t in 0..16usize {
+            // Varies everywhere, most where the product is large.
+            let value = |x: usize, y: usize| ((x * y * (t * t + 3) + 7 * x + t) % 97) as i16;
+            let picture = Image::from_fn(size.0, size.1, value);
+            variation.push(picture.data());
+            let time = t as f64 / 30.0;
+            history.push(Past { time, exposure: 0.005, placement: Placement::default() }, &picture);
+        }
+        let noise = BlockNoise::new(variation.energy(), size.0, size.1, 16);
+        let nuisance = Nuisance::of(&history, &Lamps::default());
+        let mut line: Vec<f32> = (0..16).map(|t| if t % 2 == 0 { 0.25 } else { -0.25 }).collect();
+        nuisance.remove(&mut line);
+        let families = [Family { requests: vec![0], lines: vec![line] }];
+        let energy = variation.energy();
+        let (history, noise, nuisance) = (&history, &noise, &nuisance);
+        let view = View { history, size, energy, noise, nuisance, presence: 1.0 };
+        let scan = |steps: usize| {
+            let mut sweep = Sweep::new(size.1, [1].into_iter());
+            let mut results = (0..steps).filter_map(|_| sweep.step(&view, &families, steps));
+            results.next().expect("the last step ends the scan")
+        };
+        let whole = scan(1);
+        assert!(whole.len() > 8, "{}", whole.len());
+        for steps in [2, 3, 7] {
+            assert_eq!(scan(steps), whole, "{steps} steps");
+        }
+    }
 }
