@@ -1,8 +1,9 @@
 //! Time per 640x480 frame of either method, for 1, 16 and 64 patterns, over tag-free video.
 //!
-//! An iteration is a frame, a sample the mean over 120 of them, as scans of the sequential method fall on
-//! some frames and not on others. Its first sample is the start, where scans come more often (mostly the
-//! slowest), the last one is frames 361 to 480.
+//! `sequential` and `paper`: an iteration is a frame, a sample the mean over 120 of them. The first sample
+//! is the start, where scans come more often (mostly the slowest), the last one is frames 361 to 480.
+//! `sequential_single`: a sample is one frame, so that its slowest is the worst frame of all. The memory
+//! of the window is taken before the first frame.
 
 use std::time::Duration;
 
@@ -14,6 +15,10 @@ use vergence_landmark::synthetic::Scene;
 use vergence_landmark::{Finder, Request};
 use vergence_tag::Pattern;
 use vergence_tag::codebook::Rules;
+
+/// Columns and rows of a frame.
+const WIDTH: usize = 640;
+const HEIGHT: usize = 480;
 
 /// Frames of a sample.
 const BATCH: u32 = 120;
@@ -39,7 +44,7 @@ fn requests(count: usize) -> Vec<Request> {
 
 /// So many frames. None is shown twice: noise that repeats is a pattern.
 fn video(frames: u32) -> Vec<Frame> {
-    let scene = Scene::textured(640, 480, 1);
+    let scene = Scene::textured(WIDTH, HEIGHT, 1);
     let mut film = scene.film(2);
     (0..frames).map(|_| film.next_frame().expect("no compression, no error")).collect()
 }
@@ -56,10 +61,22 @@ fn watch<F: Finder>(bencher: Bencher, video: &[Frame], start: impl Fn() -> F) {
     });
 }
 
+/// A finder that is ready for the first frame.
+fn ready(patterns: usize) -> SequentialFinder {
+    let finder = SequentialFinder::new(requests(patterns), Default::default());
+    let mut finder = finder.expect("the requests differ");
+    finder.prepare((WIDTH, HEIGHT));
+    finder
+}
+
 #[divan::bench(args = [1, 16, 64], sample_count = SAMPLES, sample_size = BATCH)]
 fn sequential(bencher: Bencher, patterns: usize) {
-    let start = || SequentialFinder::new(requests(patterns), Default::default());
-    watch(bencher, &video(SAMPLES * BATCH), || start().expect("the requests differ"));
+    watch(bencher, &video(SAMPLES * BATCH), || ready(patterns));
+}
+
+#[divan::bench(args = [1, 16, 64], sample_count = SAMPLES * BATCH, sample_size = 1)]
+fn sequential_single(bencher: Bencher, patterns: usize) {
+    watch(bencher, &video(SAMPLES * BATCH), || ready(patterns));
 }
 
 #[divan::bench(args = [1, 16, 64], sample_count = 2, sample_size = BATCH)]

@@ -8,7 +8,7 @@ use vergence_imaging::{Frame, Image};
 
 use super::evidence::{Evidence, Series, refine, weigh};
 use super::front::Variation;
-use super::history::{History, Past, noise_share};
+use super::history::{History, noise_share};
 use super::motion::Reference;
 use super::nuisance::{Lamps, Nuisance};
 use super::scan::{BlockNoise, MARGIN};
@@ -109,10 +109,10 @@ impl Watcher {
         let (mut sequence, mut reference) = (Sequence::default(), Reference::default());
         for frame in frames {
             let time = sequence.accept(frame)?;
-            let past: Past = past(&mut reference, frame, time, None);
-            watcher.variation.push(past.filtered.data());
-            let (w, h) = (past.filtered.width(), past.filtered.height());
-            watcher.history.push(past);
+            let (past, filtered) = past(&mut reference, frame, time, None);
+            watcher.variation.push(filtered.data());
+            watcher.history.push(past, &filtered);
+            let (w, h) = watcher.history.size();
             let n = watcher.history.len();
             watcher.noise = BlockNoise::new(watcher.variation.energy(), w, h, n);
             watcher.nuisance = Nuisance::of(&watcher.history, &Lamps::of(&watcher.history));

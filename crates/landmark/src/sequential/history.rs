@@ -1,5 +1,6 @@
 //! The last filtered frames, and the brightness over time at any place between pixels.
 
+use std::array::from_fn;
 use std::collections::VecDeque;
 use std::ops::Range;
 
@@ -19,8 +20,6 @@ pub struct Past {
     pub exposure: f64,
     /// Where the picture lay; the brightness of its rows is smoothed.
     pub placement: Placement,
-    /// The filtered picture, moved back to where the first frame lay.
-    pub filtered: Image<i16>,
 }
 
 /// A window of frames of constant length.
@@ -28,6 +27,11 @@ pub struct Past {
 pub struct History {
     frames: VecDeque<Past>,
     capacity: usize,
+    /// Columns and rows.
+    size: (usize, usize),
+    /// The filtered pictures, moved back to where the first frame lay. All frames of a row lie side by
+    /// side, as whoever looks back looks at few rows; a new frame takes the place of the oldest.
+    pictures: Vec<i16>,
     /// Frames that have left.
     gone: usize,
     /// Times since the first frame and exposures (s).
@@ -39,25 +43,52 @@ pub struct History {
 impl History {
     /// An empty window.
     pub fn new(capacity: usize) -> Self {
-        History { frames: VecDeque::new(), capacity, gone: 0, times: Vec::new(), shifts: [0.0; 3] }
+        History {
+            frames: VecDeque::new(),
+            capacity,
+            size: (0, 0),
+            pictures: Vec::new(),
+            gone: 0,
+            times: Vec::new(),
+            shifts: [0.0; 3],
+        }
     }
 
-    /// Adds a frame; when the window is full the oldest leaves, and its picture is given back to be
-    /// used again.
-    pub fn push(&mut self, past: Past) -> Option<Image<i16>> {
-        let mut left = None;
+    /// Takes all memory for pictures of so many columns and rows. It is written, so that no frame has to
+    /// wait until the system hands it out.
+    pub fn prepare(&mut self, (width, height): (usize, usize)) {
+        if self.size != (width, height) {
+            self.size = (width, height);
+            self.pictures = vec![i16::MIN; width * height * self.capacity];
+        }
+    }
+
+    /// Adds a frame and its filtered picture; when the window is full the oldest leaves.
+    pub fn push(&mut self, past: Past, filtered: &Image<i16>) {
+        self.prepare((filtered.width(), filtered.height()));
         if self.frames.len() == self.capacity {
-            left = self.frames.pop_front().map(|p| {
-                self.count(&p.placement, -1.0);
-                p.filtered
-            });
+            if let Some(oldest) = self.frames.pop_front() {
+                self.count(&oldest.placement, -1.0);
+            }
             self.times.remove(0);
             self.gone += 1;
         }
         self.times.push((past.time, past.exposure));
         self.count(&past.placement, 1.0);
         self.frames.push_back(past);
-        left
+        let (slot, width) = (self.numbers().last().unwrap_or(0) % self.capacity, self.size.0);
+        let places = self.pictures.chunks_exact_mut(width).skip(slot).step_by(self.capacity);
+        for (place, row) in places.zip(filtered.data().chunks_exact(width)) {
+            place.copy_from_slice(row);
+        }
+    }
+
+    /// One row of the filtered pictures, frame by frame.
+    fn row(&self, y: usize) -> impl Iterator<Item = &[i16]> {
+        let (width, length) = (self.size.0, self.size.0 * self.capacity);
+        let (newer, older) =
+            self.pictures[y * length..][..length].split_at(self.gone % self.capacity * width);
+        older.chunks_exact(width).chain(newer.chunks_exact(width)).take(self.frames.len())
     }
 
     fn count(&mut self, Placement { dx, dy, .. }: &Placement, sign: f64) {
@@ -79,6 +110,11 @@ impl History {
     /// The frames, oldest first.
     pub fn frames(&self) -> &VecDeque<Past> {
         &self.frames
+    }
+
+    /// Columns and rows of the pictures.
+    pub fn size(&self) -> (usize, usize) {
+        self.size
     }
 
     /// Number of frames.
@@ -105,28 +141,40 @@ impl History {
         (self.shifts[2] / n - mx * mx - my * my).max(0.0).sqrt()
     }
 
-    /// Brightness over time (grey levels of a light there) at a place of the first frame.
+    /// Brightness over time (grey levels of a light there) at a place of the first frame: Catmull-Rom
+    /// interpolation between pixels, clamped to the border.
     pub fn series(&self, place: Point2<f64>, out: &mut Vec<f32>) {
+        let (fx, fy) = (place.x.floor(), place.y.floor());
+        let (wx, wy) = (weights((place.x - fx) as f32), weights((place.y - fy) as f32));
+        let clamp = |v: f64, k: usize, n: usize| (v as i64 - 1 + k as i64).clamp(0, n as i64 - 1);
+        let columns: [usize; 4] = from_fn(|k| clamp(fx, k, self.size.0) as usize);
         out.clear();
-        out.extend(self.frames.iter().map(|p| cubic(&p.filtered, place.x, place.y) / GAIN));
+        out.resize(self.len(), 0.0);
+        for (k, wy) in wy.iter().enumerate() {
+            let row = self.row(clamp(fy, k, self.size.1) as usize);
+            for (sum, row) in out.iter_mut().zip(row) {
+                let along: f32 = columns.iter().zip(wx).map(|(x, w)| w * f32::from(row[*x])).sum();
+                *sum += wy / GAIN * along;
+            }
+        }
     }
 
     /// The same on a pixel.
     pub fn series_at(&self, (x, y): (usize, usize), out: &mut Vec<f32>) {
         out.clear();
-        let scale = 1.0 / GAIN;
-        out.extend(self.frames.iter().map(|p| f32::from(p.filtered.row(y)[x]) * scale));
+        out.extend(self.row(y).map(|row| f32::from(row[x]) * (1.0 / GAIN)));
     }
 
     /// Change of brightness since the first frame of the window for many pixels of one row, frame by
     /// frame for all pixels: memory is read and written in the order in which it lies.
     pub fn changes_of_row(&self, y: usize, columns: &[usize], out: &mut Vec<f32>) {
-        out.clear();
-        let Some(first) = self.frames.front().map(|p| p.filtered.row(y)) else { return };
-        for past in &self.frames {
-            let row = past.filtered.row(y);
-            let change = |&x: &usize| f32::from(row[x].wrapping_sub(first[x])) * (1.0 / GAIN);
-            out.extend(columns.iter().map(change));
+        out.resize(columns.len() * self.len(), 0.0);
+        let Some(first) = self.row(y).next() else { return };
+        let first: Vec<i16> = columns.iter().map(|&x| first[x]).collect();
+        for (row, out) in self.row(y).zip(out.chunks_exact_mut(columns.len().max(1))) {
+            for ((change, &x), first) in out.iter_mut().zip(columns).zip(&first) {
+                *change = f32::from(row[x].wrapping_sub(*first)) * (1.0 / GAIN);
+            }
         }
     }
 }
@@ -148,22 +196,4 @@ pub fn noise_share(place: Point2<f64>) -> f64 {
         }
     }
     f64::from(share)
-}
-
-/// Catmull-Rom interpolation between pixels, clamped to the border.
-fn cubic(image: &Image<i16>, x: f64, y: f64) -> f32 {
-    let (fx, fy) = (x.floor(), y.floor());
-    let (wx, wy) = (weights((x - fx) as f32), weights((y - fy) as f32));
-    let (x0, y0) = (fx as i64 - 1, fy as i64 - 1);
-    let clamp = |v: i64, n: usize| v.clamp(0, n as i64 - 1) as usize;
-    let mut sum = 0.0;
-    for (j, wy) in wy.iter().enumerate() {
-        let row = image.row(clamp(y0 + j as i64, image.height()));
-        let mut line = 0.0;
-        for (i, wx) in wx.iter().enumerate() {
-            line += wx * f32::from(row[clamp(x0 + i as i64, image.width())]);
-        }
-        sum += wy * line;
-    }
-    sum
 }

@@ -21,6 +21,7 @@ pub mod evidence;
 pub mod explain;
 pub mod front;
 pub mod history;
+mod median;
 pub mod motion;
 pub mod nuisance;
 pub mod places;
@@ -44,7 +45,7 @@ use history::{History, Past};
 use motion::{Placement, Reference};
 use nuisance::{Lamps, Nuisance, STILL_PX};
 use places::Places;
-use scan::{BlockNoise, Candidate, Family, Strong};
+use scan::{BlockNoise, Family, Strong, Sweep, View};
 use verdict::{Banks, Round};
 
 /// Settings of the sequential finder.
@@ -79,7 +80,7 @@ impl Default for Config {
 /// First frame count at which evidence is weighed.
 const FIRST_FRAMES: usize = 6;
 
-/// First frame count at which the picture is scanned for weak lights.
+/// First frame count at which the picture has been scanned for weak lights.
 const FIRST_SCAN: usize = 16;
 
 /// How often (frames) places that vary strongly are added to the short list after the first frames.
@@ -99,7 +100,7 @@ pub struct SequentialFinder {
     reference: Reference,
     variation: Option<Variation>,
     history: History,
-    /// Memory of the picture that left the window last.
+    /// Memory for the next filtered picture.
     spare: Option<Image<i16>>,
     noise: BlockNoise,
     lamps: Lamps,
@@ -109,11 +110,20 @@ pub struct SequentialFinder {
     banks: Banks,
     decisions: Vec<Decision>,
     frames: usize,
+    /// The scan that is under way.
+    sweep: Option<Sweep>,
+    /// Frame count at which the next scan is to be complete.
     next_scan: usize,
     size: (usize, usize),
 }
 
 impl SequentialFinder {
+    /// Takes the memory for pictures of so many columns and rows, which takes as long as many frames do;
+    /// otherwise the first frame does.
+    pub fn prepare(&mut self, size: (usize, usize)) {
+        self.history.prepare(size);
+    }
+
     /// A finder for these requests.
     pub fn new(requests: Vec<Request>, config: Config) -> Result<Self, FinderError> {
         check_requests(&requests)?;
@@ -132,6 +142,7 @@ impl SequentialFinder {
             places: Places::default(),
             restless: Vec::new(),
             frames: 0,
+            sweep: None,
             next_scan: FIRST_SCAN,
             size: (0, 0),
             config,
@@ -143,20 +154,46 @@ impl SequentialFinder {
         self.frames
     }
 
-    /// Looks at the places that are due, after a scan of the whole picture where that is wanted.
-    fn round(&mut self, scan: bool, last: bool, stamp: Duration) {
+    /// Looks at the places that are due, after the next step of a scan where one is due or under way.
+    fn round(&mut self, last: bool, stamp: Duration) {
         let Some(variation) = &self.variation else { return };
         let ((width, height), n) = (self.size, self.history.len());
-        let energy = variation.energy();
-        if scan || self.frames <= FIRST_SCAN {
+        let (energy, presence) = (variation.energy(), self.presence());
+        // A scan under way would not see the last frames everywhere.
+        let steps = if last { 1 } else { Sweep::frames(self.size, n) };
+        let begins = last || (self.sweep.is_none() && self.frames + steps > self.next_scan);
+        if begins || self.frames <= FIRST_SCAN {
             self.noise = BlockNoise::new(energy, width, height, n);
         }
-        if scan {
+        if begins {
             self.lamps = Lamps::of(&self.history);
-            let candidates = self.scan(energy);
-            self.places.renew(candidates, KEEP * self.presence());
+            self.sweep = Some(Sweep::new(height, self.families.iter().map(Vec::len)));
         }
-        if scan || self.frames <= FIRST_SCAN || self.frames.is_multiple_of(STRONG_EVERY) {
+        let nuisance = Nuisance::of(&self.history, &self.lamps);
+        let candidates = match &mut self.sweep {
+            Some(sweep) => {
+                let families = lines(&self.requests, &self.families, &self.history, &nuisance);
+                let view = View {
+                    history: &self.history,
+                    size: self.size,
+                    energy,
+                    noise: &self.noise,
+                    nuisance: &nuisance,
+                    presence,
+                };
+                sweep.step(&view, &families, steps)
+            }
+            None => None,
+        };
+        let scanned = candidates.is_some();
+        if let Some(candidates) = candidates {
+            self.sweep = None;
+            self.places.renew(candidates, KEEP * presence);
+            // A third more evidence; a full window gains none, it only forgets.
+            let longest = self.config.window_frames / 2;
+            self.next_scan = self.frames + (self.frames / 3).clamp(FIRST_SCAN / 2, longest);
+        }
+        if scanned || self.frames <= FIRST_SCAN || self.frames.is_multiple_of(STRONG_EVERY) {
             let strong = scan::by_energy(energy, width, height, n, &self.noise);
             let point = |s: &Strong| Point2::new(s.pixel.0 as f64, s.pixel.1 as f64);
             self.restless = strong.iter().filter(|s| s.restless).map(point).collect();
@@ -164,10 +201,10 @@ impl SequentialFinder {
                 self.places.add(pixel, 0..self.requests.len());
             }
         }
-        if !scan && !self.places.any_due(self.frames) {
+        let before_next_turn = self.frames + verdict::turns(self.requests.len()) - 1;
+        if !scanned && !self.places.any_due(before_next_turn) {
             return;
         }
-        let nuisance = Nuisance::of(&self.history, &self.lamps);
         let known =
             self.decisions.iter().filter_map(Decision::brightest).map(|s| s.pixel).collect();
         let round = Round {
@@ -184,7 +221,7 @@ impl SequentialFinder {
         };
         let places = self.places.as_mut_slice();
         round.decide(places, &mut self.banks, last, &mut self.decisions);
-        if scan {
+        if scanned {
             round.rule_out(&mut self.decisions);
         }
     }
@@ -193,23 +230,23 @@ impl SequentialFinder {
     fn presence(&self) -> f64 {
         verdict::presence::presence(self.size, self.requests.len(), self.config.false_alarm)
     }
+}
 
-    /// The places whose light may be that of a pattern.
-    fn scan(&self, energy: &[f32]) -> Vec<Candidate> {
-        let nuisance = Nuisance::of(&self.history, &self.lamps);
-        let times = self.history.times();
-        let family = |requests: &Vec<usize>| {
-            let pattern = |r: &usize| &self.requests[*r].pattern;
-            let patterns: Vec<&Pattern> = requests.iter().map(pattern).collect();
-            Family {
-                requests: requests.clone(),
-                lines: template::lines(&patterns, times, &nuisance),
-            }
-        };
-        let families: Vec<Family> = self.families.iter().map(family).collect();
-        let (history, noise, presence) = (&self.history, &self.noise, self.presence());
-        scan::by_lines(history, energy, self.size, noise, &nuisance, &families, presence)
-    }
+/// The lines of the spectra of every family over the window.
+fn lines(
+    requests: &[Request],
+    families: &[Vec<usize>],
+    history: &History,
+    nuisance: &Nuisance,
+) -> Vec<Family> {
+    let family = |kin: &Vec<usize>| {
+        let patterns: Vec<&Pattern> = kin.iter().map(|r| &requests[*r].pattern).collect();
+        Family {
+            requests: kin.clone(),
+            lines: template::lines(&patterns, history.times(), nuisance),
+        }
+    };
+    families.iter().map(family).collect()
 }
 
 /// Requests grouped by length and chip of their patterns.
@@ -229,11 +266,16 @@ fn families(requests: &[Request]) -> Vec<Vec<usize>> {
 }
 
 /// Registers and filters a frame.
-fn past(reference: &mut Reference, frame: &Frame, time: f64, reuse: Option<Image<i16>>) -> Past {
+fn past(
+    reference: &mut Reference,
+    frame: &Frame,
+    time: f64,
+    reuse: Option<Image<i16>>,
+) -> (Past, Image<i16>) {
     let mut placement = reference.place(&frame.image);
     placement.row_gain = nuisance::smoothed(&placement.row_gain);
     let filtered = still(front::filter(&frame.image, reuse), &placement);
-    Past { time, exposure: frame.exposure.as_secs_f64(), placement, filtered }
+    (Past { time, exposure: frame.exposure.as_secs_f64(), placement }, filtered)
 }
 
 /// The filtered frame, moved back to where the first frame lay.
@@ -241,27 +283,27 @@ fn still(filtered: Image<i16>, placement: &Placement) -> Image<i16> {
     if placement.dx.hypot(placement.dy) < STILL_PX {
         return filtered;
     }
-    shift::shifted(&filtered, placement.dx, placement.dy).map(shift::rounded)
+    let mut moved = Image::filled(filtered.width(), filtered.height(), 0);
+    shift::shift_rows(&filtered, placement.dx, placement.dy, |y, row| {
+        shift::round(moved.row_mut(y), row);
+    });
+    moved
 }
 
 impl Finder for SequentialFinder {
     fn push(&mut self, frame: &Frame) -> Result<(), FinderError> {
         let time = self.sequence.accept(frame)?;
         self.size = (frame.image.width(), frame.image.height());
-        let past = past(&mut self.reference, frame, time, self.spare.take());
+        let (past, filtered) = past(&mut self.reference, frame, time, self.spare.take());
         let pixels = self.size.0 * self.size.1;
         let window = self.config.window_frames;
         let variation = self.variation.get_or_insert_with(|| Variation::new(pixels, window));
-        variation.push(past.filtered.data());
-        self.spare = self.history.push(past);
+        variation.push(filtered.data());
+        self.history.push(past, &filtered);
+        self.spare = Some(filtered);
         self.frames += 1;
         if self.frames >= FIRST_FRAMES {
-            let scan = self.frames >= self.next_scan;
-            self.round(scan, false, frame.stamp);
-            if scan {
-                // A third more evidence; a full window gains none, it only forgets.
-                self.next_scan = self.frames + (self.frames / 3).clamp(FIRST_SCAN / 2, window / 2);
-            }
+            self.round(false, frame.stamp);
         }
         Ok(())
     }
@@ -269,7 +311,7 @@ impl Finder for SequentialFinder {
     fn finish(&mut self) {
         let last = self.sequence.last_stamp();
         if let (Some(stamp), true) = (last, self.frames >= FIRST_FRAMES) {
-            self.round(true, true, stamp);
+            self.round(true, stamp);
         }
     }
 

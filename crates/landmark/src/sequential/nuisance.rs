@@ -200,29 +200,15 @@ pub fn dot(a: &[f32], b: &[f32]) -> f32 {
     lanes.iter().sum::<f32>() + tail
 }
 
-/// Columns that are added up side by side.
-const BLOCK: usize = 16;
-
 /// Scalar product of `vector` with the first columns of a table of rows of `width` numbers, as many
 /// rows as the vector is long: many series, or many expected lights, side by side.
 #[multiversion::multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
 pub fn dot_columns(vector: &[f32], table: &[f32], width: usize, out: &mut [f32]) {
-    let mut blocks = out.chunks_exact_mut(BLOCK);
-    let mut from = 0;
-    for out in &mut blocks {
-        let mut sums = [0.0f32; BLOCK];
-        for (v, row) in vector.iter().zip(table.chunks_exact(width)) {
-            let row = &row[from..from + BLOCK];
-            for k in 0..BLOCK {
-                sums[k] += v * row[k];
-            }
+    out.fill(0.0);
+    for (v, row) in vector.iter().zip(table.chunks_exact(width)) {
+        for (sum, t) in out.iter_mut().zip(row) {
+            *sum += v * t;
         }
-        out.copy_from_slice(&sums);
-        from += BLOCK;
-    }
-    for (k, out) in blocks.into_remainder().iter_mut().enumerate() {
-        let column = table.iter().skip(from + k).step_by(width);
-        *out = vector.iter().zip(column).map(|(v, t)| v * t).sum();
     }
 }
 

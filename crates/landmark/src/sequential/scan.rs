@@ -5,12 +5,14 @@
 //! neighbours, about one in nine, and not much less than a light would that is nearly decided, are
 //! tested for the lines of the patterns; patterns of one length and chip have the same lines and are
 //! tested at once. The best few places go on. Choosing by rank, not by a threshold on the evidence,
-//! keeps the cost constant and needs no noise model.
+//! keeps the cost constant and needs no noise model. A scan is spread over frames, as no single one may
+//! take long.
 
 use std::ops::Range;
 
 use super::front::{GAIN, NOISE_GAIN};
 use super::history::History;
+use super::median::median;
 use super::nuisance::{Nuisance, dot_columns, squares_of_columns};
 
 /// Side of a block (px).
@@ -27,6 +29,13 @@ pub const BY_ENERGY: usize = 48;
 
 /// Distance from the border (px) within which nothing is looked for.
 pub const MARGIN: usize = 4;
+
+/// Pixels, over all frames of the window, that a scan reads at one frame; more of a large picture, so
+/// that it takes no longer than an eighth of the window.
+const STEP: usize = LEAST_FRAMES * 640 * 480;
+
+/// Frames that a scan reads of a large picture at one frame.
+const LEAST_FRAMES: usize = 8;
 
 /// Variance that rounding to grey levels alone leaves (filter units squared).
 const LEAST_VARIANCE: f32 = NOISE_GAIN * NOISE_GAIN / 12.0;
@@ -53,9 +62,8 @@ impl BlockNoise {
                 // Neighbours see the same noise; every second pixel says nearly as much as all.
                 values.extend(row.iter().skip(y / 2 % 2).step_by(2));
             }
-            let middle = values.len() / 2;
-            let median = *values.select_nth_unstable_by(middle, f32::total_cmp).1;
-            variance.push((median / frames.saturating_sub(1).max(1) as f32).max(LEAST_VARIANCE));
+            let energy = median(&values);
+            variance.push((energy / frames.saturating_sub(1).max(1) as f32).max(LEAST_VARIANCE));
         }
         BlockNoise { across, variance }
     }
@@ -172,28 +180,78 @@ pub struct Family {
     pub lines: Vec<Vec<f32>>,
 }
 
-/// Tests the varying pixels for the lines of every family; the best places of each.
-///
-/// `presence`: log likelihood ratio of a light that is decided.
-pub fn by_lines(
-    history: &History,
-    energy: &[f32],
-    (width, height): (usize, usize),
-    noise: &BlockNoise,
-    nuisance: &Nuisance,
-    families: &[Family],
-    presence: f64,
-) -> Vec<Candidate> {
+/// A scan of the whole picture, some rows of it at every frame.
+#[derive(Debug, Clone)]
+pub struct Sweep {
+    /// The best places so far of every family.
+    best: Vec<Best>,
+    /// The rows that are still to be looked at.
+    rows: Range<usize>,
+}
+
+impl Sweep {
+    /// Frames over which a scan of a window of so many frames is spread.
+    pub fn frames((width, height): (usize, usize), window: usize) -> usize {
+        (width * height * window).div_ceil(STEP).min(window.div_ceil(LEAST_FRAMES))
+    }
+
+    /// A scan that has not begun; `families`: the number of requests of each.
+    pub fn new(height: usize, families: impl Iterator<Item = usize>) -> Self {
+        Sweep { best: families.map(Best::of).collect(), rows: MARGIN..height - MARGIN }
+    }
+
+    /// Looks at the next rows, as many as make `steps` steps of the picture; all that are left when it
+    /// is one. The best places of every family once all rows have been looked at.
+    pub fn step(
+        &mut self,
+        view: &View,
+        families: &[Family],
+        steps: usize,
+    ) -> Option<Vec<Candidate>> {
+        let from = self.rows.start;
+        self.rows.start = (from + view.size.1.div_ceil(steps)).min(self.rows.end);
+        by_lines(view, families, from..self.rows.start, &mut self.best);
+        if !self.rows.is_empty() {
+            return None;
+        }
+        let mut candidates = Vec::new();
+        for (family, best) in families.iter().zip(&mut self.best) {
+            let candidate = |(_, pixel)| Candidate { pixel, requests: family.requests.clone() };
+            candidates.extend(best.list.drain(..).map(candidate));
+        }
+        Some(candidates)
+    }
+}
+
+/// What a scan looks at.
+pub struct View<'a> {
+    /// The window.
+    pub history: &'a History,
+    /// Columns and rows.
+    pub size: (usize, usize),
+    /// Energy of every pixel.
+    pub energy: &'a [f32],
+    /// Noise of every block.
+    pub noise: &'a BlockNoise,
+    /// What else changes.
+    pub nuisance: &'a Nuisance,
+    /// Log likelihood ratio of a light that is decided.
+    pub presence: f64,
+}
+
+/// Tests the varying pixels of some rows for the lines of every family; adds to the best places of each.
+fn by_lines(view: &View, families: &[Family], rows: Range<usize>, best: &mut [Best]) {
+    let View { history, energy, noise, nuisance, .. } = *view;
+    let width = view.size.0;
     let n = history.len();
-    let limit = chi_square(n, least_excess(n, presence));
-    let mut best: Vec<Best> = families.iter().map(|f| Best::of(f.requests.len())).collect();
+    let limit = chi_square(n, least_excess(n, view.presence));
     let vectors = families.iter().flat_map(|f| &f.lines).chain(nuisance.basis());
     let vectors: Vec<&[f32]> = vectors.map(Vec::as_slice).collect();
     let (mut series, mut columns) = (Vec::new(), Vec::with_capacity(width / 2));
     let (mut shares, mut totals) = (Vec::new(), Vec::new());
     let mut limits = vec![0.0; width];
-    for y in MARGIN..height - MARGIN {
-        if y == MARGIN || y % BLOCK == 0 {
+    for y in rows.clone() {
+        if y == rows.start || y % BLOCK == 0 {
             noise.along(y, limit, &mut limits);
         }
         columns.clear();
@@ -216,7 +274,7 @@ pub fn by_lines(
             let taken = shares[lines * count..].iter().skip(k).step_by(count);
             let total = totals[k] - taken.sum::<f32>() + 40.0 * noise.at(x, y) as f32;
             let mut from = 0;
-            for (family, best) in families.iter().zip(&mut best) {
+            for (family, best) in families.iter().zip(&mut *best) {
                 let to = from + family.lines.len();
                 let own = shares[from * count..to * count].iter().skip(k).step_by(count);
                 let explained = own.sum::<f32>();
@@ -228,13 +286,6 @@ pub fn by_lines(
             }
         }
     }
-    let mut candidates = Vec::new();
-    for (family, best) in families.iter().zip(best) {
-        let requests = &family.requests;
-        let candidate = |(_, pixel)| Candidate { pixel, requests: requests.clone() };
-        candidates.extend(best.list.into_iter().map(candidate));
-    }
-    candidates
 }
 
 /// By how many standard deviations of chance the energy of a light exceeds the noise when its evidence
@@ -247,6 +298,7 @@ fn least_excess(frames: usize, presence: f64) -> f32 {
 }
 
 /// A list of the best places, no two of them neighbours, best first.
+#[derive(Debug, Clone)]
 struct Best {
     list: Vec<(f32, (usize, usize))>,
     most: usize,
@@ -286,4 +338,47 @@ fn peaks(energy: &[f32], width: usize, y: usize, limits: &[f32], columns: &mut V
         let e = here[x];
         e > limits[x] && e >= here[x - 1] && e > here[x + 1] && is_peak([above, here, below], x)
     }));
+}
+
+#[cfg(test)]
+mod tests {
+    use vergence_imaging::Image;
+
+    use super::super::front::Variation;
+    use super::super::history::Past;
+    use super::super::motion::Placement;
+    use super::super::nuisance::Lamps;
+    use super::*;
+
+    #[test]
+    fn a_scan_in_steps_finds_what_one_at_once_finds() {
+        let size = (48, 40);
+        let (mut history, mut variation) = (History::new(16), Variation::new(48 * 40, 16));
+        for t in 0..16usize {
+            // Varies everywhere, most where the product is large.
+            let value = |x: usize, y: usize| ((x * y * (t * t + 3) + 7 * x + t) % 97) as i16;
+            let picture = Image::from_fn(size.0, size.1, value);
+            variation.push(picture.data());
+            let time = t as f64 / 30.0;
+            history.push(Past { time, exposure: 0.005, placement: Placement::default() }, &picture);
+        }
+        let noise = BlockNoise::new(variation.energy(), size.0, size.1, 16);
+        let nuisance = Nuisance::of(&history, &Lamps::default());
+        let mut line: Vec<f32> = (0..16).map(|t| if t % 2 == 0 { 0.25 } else { -0.25 }).collect();
+        nuisance.remove(&mut line);
+        let families = [Family { requests: vec![0], lines: vec![line] }];
+        let energy = variation.energy();
+        let (history, noise, nuisance) = (&history, &noise, &nuisance);
+        let view = View { history, size, energy, noise, nuisance, presence: 1.0 };
+        let scan = |steps: usize| {
+            let mut sweep = Sweep::new(size.1, [1].into_iter());
+            let mut results = (0..steps).filter_map(|_| sweep.step(&view, &families, steps));
+            results.next().expect("the last step ends the scan")
+        };
+        let whole = scan(1);
+        assert!(whole.len() > 8, "{}", whole.len());
+        for steps in [2, 3, 7] {
+            assert_eq!(scan(steps), whole, "{steps} steps");
+        }
+    }
 }

@@ -17,32 +17,55 @@ pub fn weights(t: f32) -> [f32; 4] {
 /// The picture sampled at `(x + dx, y + dy)` for every pixel `(x, y)`, clamped to the border: takes
 /// out a shift of the content by `(dx, dy)`.
 pub fn shifted<T: Copy + Into<f32>>(image: &Image<T>, dx: f64, dy: f64) -> Image<f32> {
+    let mut out = Image::filled(image.width(), image.height(), 0.0f32);
+    shift_rows(image, dx, dy, |y, row| out.row_mut(y).copy_from_slice(row));
+    out
+}
+
+/// The same, row by row from the top, for who wants no picture of such numbers.
+pub fn shift_rows<T: Copy + Into<f32>>(
+    image: &Image<T>,
+    dx: f64,
+    dy: f64,
+    mut take: impl FnMut(usize, &[f32]),
+) {
     let (width, height) = (image.width(), image.height());
     let (fx, fy) = (dx.floor(), dy.floor());
     let (wx, wy) = (weights((dx - fx) as f32), weights((dy - fy) as f32));
     let (x0, y0) = (fx as i64 - 1, fy as i64 - 1);
-    let mut out = Image::filled(width, height, 0.0f32);
-    let mut column = vec![0.0f32; width];
+    let (mut out, mut column) = (vec![0.0f32; width], vec![0.0f32; width]);
     let mut padded = vec![0.0f32; width + 3];
+    // The part of a padded row that lies inside the picture; so much of the row is left of it.
+    let inside = |x: i64| x.clamp(0, width as i64 + 3) as usize;
+    let (before, after) = (inside(-x0), inside(width as i64 - x0));
+    let from = x0.clamp(0, width as i64) as usize;
     for y in 0..height {
         column.fill(0.0);
         for (j, &weight) in wy.iter().enumerate() {
             let from = (y as i64 + y0 + j as i64).clamp(0, height as i64 - 1) as usize;
-            for (c, &v) in column.iter_mut().zip(image.row(from)) {
-                *c += weight * v.into();
-            }
+            add(&mut column, image.row(from), weight);
         }
-        for (i, p) in padded.iter_mut().enumerate() {
-            *p = column[(i as i64 + x0).clamp(0, width as i64 - 1) as usize];
-        }
-        along_row(out.row_mut(y), &padded, wx);
+        padded[..before].fill(column[0]);
+        padded[before..after].copy_from_slice(&column[from..from + after - before]);
+        padded[after..].fill(column[width - 1]);
+        along_row(&mut out, &padded, wx);
+        take(y, &out);
     }
-    out
 }
 
-/// The nearest whole number, without a call of the C library for every pixel.
-pub fn rounded(value: f32) -> i16 {
-    ((value + 32_768.5) as i32 - 32_768) as i16
+#[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
+fn add<T: Copy + Into<f32>>(sums: &mut [f32], row: &[T], weight: f32) {
+    for (sum, &v) in sums.iter_mut().zip(row) {
+        *sum += weight * v.into();
+    }
+}
+
+/// The nearest whole numbers, without a call of the C library for each.
+#[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
+pub fn round(out: &mut [i16], values: &[f32]) {
+    for (out, value) in out.iter_mut().zip(values) {
+        *out = ((value + 32_768.5) as i32 - 32_768) as i16;
+    }
 }
 
 #[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]

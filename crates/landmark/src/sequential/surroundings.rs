@@ -51,8 +51,7 @@ pub fn intruders(
     nuisance: &Nuisance,
     noise: f64,
 ) -> Vec<Vec<f32>> {
-    let Some(front) = history.frames().front() else { return Vec::new() };
-    let (width, height) = (front.filtered.width() as i64, front.filtered.height() as i64);
+    let (width, height) = (history.size().0 as i64, history.size().1 as i64);
     let n = history.len();
     let mut table = Vec::with_capacity(RING.len() * n);
     let mut series = Vec::with_capacity(n);

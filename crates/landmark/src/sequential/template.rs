@@ -18,6 +18,46 @@ pub fn light(pattern: &Pattern, times: &[(f64, f64)], phase: f64, rate: f64, out
     out.extend(times.iter().map(share));
 }
 
+/// How long a pattern has been lit since its start, from a table: a bank asks for it hundreds of times a
+/// frame.
+#[derive(Debug, Clone)]
+struct Lit {
+    /// Chips a second.
+    pace: f64,
+    /// Chips of a period.
+    length: f64,
+    /// Lit chips before each chip of a period, and once more at its end.
+    before: Vec<f64>,
+}
+
+impl Lit {
+    fn new(pattern: &Pattern) -> Self {
+        let length = pattern.bits.len();
+        let mut before = vec![0.0; length + 2];
+        for k in 0..=length {
+            before[k + 1] = before[k] + f64::from(u8::from(pattern.bits.chip(k as i64)));
+        }
+        Lit { pace: pattern.chip.as_secs_f64().recip(), length: length as f64, before }
+    }
+
+    /// Lit chips between the start and `time`, which is not before it.
+    fn chips(&self, time: f64) -> f64 {
+        let chips = time * self.pace;
+        let periods = (chips / self.length) as i64 as f64;
+        let rest = (chips - periods * self.length).max(0.0);
+        let chip = rest as usize;
+        let (before, after) = (self.before[chip], self.before[chip + 1]);
+        periods * self.before[self.length as usize]
+            + before
+            + (after - before) * (rest - chip as f64)
+    }
+
+    /// Share of light in `span` seconds from `time` on.
+    fn share(&self, time: f64, span: f64) -> f64 {
+        (self.chips(time + span) - self.chips(time)) / (span * self.pace)
+    }
+}
+
 /// One phase and rate of a bank.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hypothesis {
@@ -33,7 +73,7 @@ pub struct Hypothesis {
 /// computed twice.
 #[derive(Debug, Clone)]
 pub struct Bank {
-    pattern: Pattern,
+    lit: Lit,
     /// The hypotheses; `norm2` is that of the last [`Bank::fit`].
     pub hypotheses: Vec<Hypothesis>,
     /// So many come first that are a quarter of a chip apart: enough for a look.
@@ -67,7 +107,7 @@ impl Bank {
         };
         let hypotheses = [of(&first), of(&rest)].concat();
         Bank {
-            pattern: *pattern,
+            lit: Lit::new(pattern),
             templates: Vec::new(),
             scales: vec![0.0; hypotheses.len()],
             coarse: first.len() * rates.len(),
@@ -117,8 +157,9 @@ impl Bank {
             self.left = 0;
         }
         for &(t, e) in &times[times.len() - (frames.end - known).min(times.len())..] {
-            let share =
-                |h: &Hypothesis| self.pattern.on_fraction(h.phase + h.rate * t, h.rate * e) as f32;
+            // An exposure of no length sees one chip.
+            let span = e.max(1e-6);
+            let share = |h: &Hypothesis| self.lit.share(h.phase + h.rate * t, h.rate * span) as f32;
             self.templates.extend(self.hypotheses.iter().map(share));
         }
         self.frames = frames;

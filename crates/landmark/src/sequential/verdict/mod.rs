@@ -50,6 +50,14 @@ const GHOST: (f64, f64) = (16.0, 0.3);
 /// between pixels.
 const CLOSER: f64 = 0.5;
 
+/// Requests that are weighed at one frame where nothing is near.
+const AT_ONCE: usize = 8;
+
+/// Frames within which every request has its turn.
+pub fn turns(requests: usize) -> usize {
+    requests.div_ceil(AT_ONCE)
+}
+
 /// Everything that the decisions of one moment rest on.
 pub struct Round<'a> {
     pub requests: &'a [Request],
@@ -110,9 +118,14 @@ impl Round<'_> {
     }
 
     /// Weighs every watch that is due; whether any reached the floor, for every request. Request by
-    /// request, as a bank fits the cache and all banks together do not.
+    /// request, as a bank fits the cache and all banks together do not. Requests take turns where they
+    /// are many; what falls due before the next turn is weighed early, and what is near at every frame.
     fn weigh_due(&self, places: &mut [Place], banks: &mut Banks, thorough: bool) -> Vec<bool> {
-        let is_due = |w: &Watch| thorough || w.due <= self.frames;
+        let turns = turns(self.requests.len());
+        let is_due = |w: &Watch| {
+            let turn = w.request % turns == self.frames % turns && w.due < self.frames + turns;
+            thorough || turn || (w.level >= self.floor() && w.due <= self.frames)
+        };
         let (mut raw, mut scratch) = (Vec::new(), Vec::new());
         let mut due = Vec::new();
         for (p, place) in places.iter().enumerate() {
