@@ -16,7 +16,7 @@ impl Round<'_> {
     /// Whether a request leads every other at a place.
     pub(super) fn leads_requests(&self, request: usize, seen: &Seen, banks: &mut Banks) -> bool {
         let own = seen.evidence;
-        let series = &seen.series.settled(own.correlation.powi(2), 1);
+        let series = &seen.series.settled(own.correlation.powi(2));
         let mut scratch = Vec::new();
         let others = self.requests.len() - 1;
         for other in (0..self.requests.len()).filter(|o| *o != request) {

@@ -11,6 +11,7 @@
 
 mod absence;
 mod banks;
+mod codes;
 mod foreign;
 pub mod identity;
 mod position;
@@ -228,6 +229,6 @@ impl Round<'_> {
     fn stands(&self, request: usize, seen: &Seen, banks: &mut Banks) -> bool {
         self.is_present(seen)
             && self.leads_requests(request, seen, banks)
-            && self.leads_foreign(request, seen, banks)
+            && self.leads_foreign(request, seen)
     }
 }
