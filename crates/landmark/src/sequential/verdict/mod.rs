@@ -227,7 +227,7 @@ impl Round<'_> {
 
     /// Whether noise, the other requests and whatever else may blink are beaten.
     fn stands(&self, request: usize, seen: &Seen, banks: &mut Banks) -> bool {
-        self.is_present(seen)
+        self.is_present(request, seen)
             && self.leads_requests(request, seen, banks)
             && self.leads_foreign(request, seen)
     }
