@@ -193,9 +193,13 @@ fn product([a, b, c, d]: &Matrix, [e, f, g, h]: &Matrix) -> Matrix {
     [a * e + b * g, a * f + b * h, c * e + d * g, c * f + d * h]
 }
 
-/// A matrix scaled to a largest element of one; the logarithm of the scale is added to `log`.
+/// A matrix that is about to vanish scaled to a largest element of one; the logarithm of the scale is
+/// added to `log`.
 fn scaled(matrix: Matrix, log: &mut f64) -> Matrix {
     let top = matrix.iter().copied().fold(f64::MIN_POSITIVE, f64::max);
+    if top > 1e-100 {
+        return matrix;
+    }
     *log += top.ln();
     matrix.map(|v| v / top)
 }
