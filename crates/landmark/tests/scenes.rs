@@ -215,6 +215,37 @@ fn codes_that_nobody_asked_for_are_told_from_the_requested() {
     assert!(reports(None) > 0, "the scenes are too easy to show anything");
 }
 
+/// A flicker is also a code of twice as many chips of half the length, and each of those is requested too.
+#[test]
+fn what_is_the_request_itself_in_shorter_chips_is_no_rival() {
+    let requests = [request("flicker", "10", 80.0), request("code", "10010011", 40.0)];
+    let scene =
+        Scene { lights: vec![light(&requests[0], 20.3, 19.6, 30.0)], ..Scene::flat(40, 40) };
+    let finder = watch(&scene, &requests, 60, 1);
+    let frames = finder.decisions()[0].brightest().map(|s| s.frames);
+    assert!(frames.is_some_and(|f| f <= 30), "decided after {frames:?} frames");
+}
+
+/// Patterns that are requested, played by somebody else at another rate.
+#[test]
+fn a_requested_pattern_at_another_rate_is_not_reported() {
+    let requests: Vec<Request> = [("10", 83.0), ("10", 125.0), ("110100100101", 40.0)]
+        .iter()
+        .enumerate()
+        .map(|(k, (bits, chip))| request(&k.to_string(), bits, *chip))
+        .collect();
+    for run in 0..18usize {
+        let rate = [0.8, 0.88, 0.93, 1.07, 1.12, 1.2][run % 6];
+        let mut lamp = light(&requests[run % 3], 20.3, 19.6, 12.0 * 1.1f64.powi(run as i32));
+        (lamp.rate, lamp.phase) = (rate, 0.037 * run as f64);
+        let scene =
+            Scene { lights: vec![lamp], exposure: 0.01, frame_rate: 25.0, ..Scene::flat(40, 40) };
+        let finder = watch(&scene, &requests, 100, run as u64);
+        let found: Vec<_> = finder.decisions().iter().map(place).collect();
+        assert_eq!(found, [None; 3], "run {run}, rate {rate}");
+    }
+}
+
 proptest! {
     #![proptest_config(ProptestConfig { cases: 12, ..ProptestConfig::default() })]
 

@@ -101,21 +101,18 @@ impl Series {
     /// Variance of the noise of this place when so much of its energy is a light. A place that stays
     /// noisier than its neighbourhood, by more than chance explains, has noise of its own.
     fn noise_beside(&self, explained: f64) -> f64 {
-        if self.settled { self.noise } else { self.noise_left(explained, self.freedom) }
+        if self.settled {
+            return self.noise;
+        }
+        let own = (self.energy - explained).max(0.0) / self.freedom;
+        self.noise.max(own / (1.0 + OWN_NOISE * (2.0 / self.freedom).sqrt()))
     }
 
-    fn noise_left(&self, explained: f64, freedom: f64) -> f64 {
-        let own = (self.energy - explained).max(0.0) / freedom;
-        self.noise.max(own / (1.0 + OWN_NOISE * (2.0 / freedom).sqrt()))
-    }
-
-    /// The same series with the noise that it has beside a light of `numbers` free numbers that explains
-    /// so much of its energy, whatever it is compared with: explanations are weighed with one and the
-    /// same noise.
-    pub fn settled(&self, explained: f64, numbers: usize) -> Series {
-        let freedom = self.freedom + 1.0 - numbers as f64;
-        // With few frames beyond the free numbers, nothing is left to tell the noise by.
-        let noise = if freedom < FREE { self.noise } else { self.noise_left(explained, freedom) };
+    /// The same series with the noise that it has beside a light that explains so much of its energy,
+    /// whatever it is compared with: explanations are weighed with one and the same noise.
+    pub fn settled(&self, explained: f64) -> Series {
+        // With few frames, nothing is left to tell the noise by.
+        let noise = if self.freedom < FREE { self.noise } else { self.noise_beside(explained) };
         Series { noise, settled: true, ..self.clone() }
     }
 }
@@ -239,28 +236,14 @@ fn log_ratio(freedom: f64, prior: f64, total: f64, correlation: f64, norm2: f64)
     if correlation <= 0.0 {
         return 0.0;
     }
-    let explained = correlation * correlation;
-    let by_width = |width: f64| {
+    let (half, share) = (0.5 * (freedom + prior), correlation * correlation / total);
+    let by_width = WIDTHS.map(|(width, weight)| {
         let gain = width * width * norm2;
-        (0.5 * (1.0 + gain).ln(), explained * gain / (1.0 + gain))
-    };
+        let rest = (-share * gain / (1.0 + gain)).max(-0.999_999);
+        weight.ln() - 0.5 * (1.0 + gain).ln() - half * rest.ln_1p()
+    });
     // Half-normal: the amplitude is positive, so the prior is twice as dense there.
-    over_widths(0.5 * (freedom + prior), total, by_width) + LN_2
-}
-
-/// Log likelihood ratio of a model whose brightness is normal with a standard deviation in proportion
-/// to the width of the amplitude's prior, the mean over the widths. For each width `by_width` gives
-/// half the logarithm of the determinant of its covariance, relative to the noise, and the energy that
-/// it explains.
-pub fn over_prior(series: &Series, by_width: impl Fn(f64) -> (f64, f64)) -> f64 {
-    over_widths(0.5 * (series.freedom + NOISE_FRAMES), series.total(0.0), by_width)
-}
-
-fn over_widths(half: f64, total: f64, by_width: impl Fn(f64) -> (f64, f64)) -> f64 {
-    log_sum(&WIDTHS.map(|(width, weight)| {
-        let (log_det, explained) = by_width(width);
-        weight.ln() - log_det - half * (-explained / total).max(-0.999_999).ln_1p()
-    }))
+    log_sum(&by_width) + LN_2
 }
 
 /// Logarithm of the sum of the numbers whose logarithms are given.

@@ -11,6 +11,7 @@
 
 mod absence;
 mod banks;
+mod codes;
 mod foreign;
 pub mod identity;
 mod position;
@@ -109,7 +110,7 @@ impl Round<'_> {
         for (request, near) in near.into_iter().enumerate() {
             let sightings = if near {
                 let seen = self.seen(request, places, banks);
-                self.sightings(request, seen, places, banks)
+                self.sightings(request, seen, &decisions[request], places, banks)
             } else {
                 Vec::new()
             };
@@ -196,14 +197,16 @@ impl Round<'_> {
         }
     }
 
-    /// The places of one request that pass every test, brightest first.
+    /// The places of one request that pass every test, or did before, brightest first.
     fn sightings(
         &self,
         request: usize,
         mut seen: Vec<Seen>,
+        before: &Decision,
         places: &mut [Place],
         banks: &mut Banks,
     ) -> Vec<Sighting> {
+        let before = if let Decision::Here(before) = before { before.as_slice() } else { &[] };
         if transitions(&self.requests[request].pattern, self.history.times()) < TRANSITIONS {
             return Vec::new();
         }
@@ -228,7 +231,9 @@ impl Round<'_> {
                 distance < ONE_LIGHT
                     || (distance < GHOST.0 && sharp.evidence.amplitude() < GHOST.1 * s.amplitude)
             };
-            if kept.iter().any(ghost) || !self.stands(request, &sharp, banks) {
+            // Ville's bound is that of the first time; no need to pass again.
+            let decided = before.iter().any(|s| (s.pixel - pixel).norm() < ONE_LIGHT);
+            if kept.iter().any(ghost) || !(decided || self.stands(request, &sharp, banks)) {
                 continue;
             }
             kept.push(self.sighting(request, &sharp));
@@ -239,8 +244,8 @@ impl Round<'_> {
 
     /// Whether noise, the other requests and whatever else may blink are beaten.
     fn stands(&self, request: usize, seen: &Seen, banks: &mut Banks) -> bool {
-        self.is_present(seen)
+        self.is_present(request, seen)
             && self.leads_requests(request, seen, banks)
-            && self.leads_foreign(request, seen, banks)
+            && self.leads_foreign(request, seen)
     }
 }

@@ -10,7 +10,7 @@ use super::super::scan::MARGIN;
 use super::super::spot;
 use super::super::surroundings::intruders;
 use super::banks::Banks;
-use super::{Round, Seen};
+use super::{GHOST, Round, Seen};
 use crate::Sighting;
 
 /// Systematic part of a position's standard deviation (px): a light is no perfect point.
@@ -46,11 +46,36 @@ impl Round<'_> {
             self.history.series(place, &mut raw);
             let noise = self.noise.at(place.x as usize, place.y as usize) * noise_share(place);
             series = Series::new(&raw, self.nuisance, series.local, noise);
+            let own = evidence.correlation.powi(2);
+            if self.add_brighter(place, own, &mut series.local) {
+                series = Series::new(&raw, self.nuisance, series.local, noise);
+            }
             let again = weigh(&series, banks.own(self, request), self.floor(), &mut scratch)?;
             evidence = again;
         }
         evidence = refine(&series, pattern, self.history.times(), self.nuisance, evidence, step);
         Some(Seen { at: seen.at, place, evidence, series })
+    }
+
+    /// Adds the courses of lights close by that are so much brighter than a light of this energy that
+    /// filter and JPEG blocks leave ghosts of them, however they blink. Whether there are any.
+    fn add_brighter(&self, place: Point2<f64>, own: f64, local: &mut Vec<Vec<f32>>) -> bool {
+        let before = local.len();
+        let mut course = Vec::new();
+        for other in self.restless.iter().filter(|p| (*p - place).norm() < GHOST.0) {
+            self.history.series_at((other.x as usize, other.y as usize), &mut course);
+            self.nuisance.remove(&mut course);
+            for known in local.iter() {
+                let share = dot(known, &course);
+                course.iter_mut().zip(known).for_each(|(c, k)| *c -= share * k);
+            }
+            let energy = dot(&course, &course);
+            if GHOST.1 * GHOST.1 * f64::from(energy) > own {
+                let scale = energy.sqrt().recip();
+                local.push(course.iter().map(|c| c * scale).collect());
+            }
+        }
+        local.len() > before
     }
 
     /// Where the light is strongest near a place: on whole pixels, where nothing is interpolated, the

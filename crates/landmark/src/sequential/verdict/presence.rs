@@ -8,6 +8,7 @@
 use nalgebra::Point2;
 
 use super::super::front::BLOB_VARIANCE;
+use super::super::nuisance::dot;
 use super::{GHOST, Round, Seen};
 
 /// Restless places to reckon with where the picture shows none but the one in question: so many in so
@@ -28,14 +29,32 @@ impl Round<'_> {
     }
 
     /// Whether noise is beaten: that around, and the unknown one of a restless place.
-    pub(super) fn is_present(&self, seen: &Seen) -> bool {
+    pub(super) fn is_present(&self, request: usize, seen: &Seen) -> bool {
         // Places close by may be ghosts of this one, and a light that is known already is no riddle.
         let far = |a: &Point2<f64>, b: &Point2<f64>| (a - b).norm() > GHOST.0;
         let others = self.restless.iter().filter(|p| far(p, &seen.place));
         let unknown = others.filter(|p| self.known.iter().all(|k| far(p, k))).count() as f64;
         let area = (self.size.0 * self.size.1) as f64 / UNSEEN.1;
         let chances = (unknown + UNSEEN.0 * area) * self.requests.len() as f64;
+        let restless = seen.evidence.restless * self.whiteness(request, seen);
         seen.evidence.log_ratio >= self.presence()
-            && seen.evidence.restless >= (chances / self.config.false_alarm).ln()
+            && restless >= (chances / self.config.false_alarm).ln()
+    }
+
+    /// Share of the evidence that counts where what the request leaves has a memory of some frames, as a
+    /// screen has that changes more slowly than the camera looks: so many fewer frames tell anything.
+    fn whiteness(&self, request: usize, seen: &Seen) -> f64 {
+        let (evidence, series) = (&seen.evidence, &seen.series);
+        let (pattern, times) = (&self.requests[request].pattern, self.history.times());
+        let (best, mut rest) = ((evidence.best.phase, evidence.best.rate), Vec::new());
+        series.expect(pattern, times, best, self.nuisance, &mut rest);
+        let amplitude = evidence.amplitude() as f32;
+        rest.iter_mut().zip(&series.values).for_each(|(r, v)| *r = v - amplitude * *r);
+        let (energy, n) = (dot(&rest, &rest).max(1e-9), rest.len());
+        // Beyond what chance shows of white noise.
+        let memory =
+            f64::from(dot(&rest[1..], &rest[..n - 1]) / energy) - (n as f64).sqrt().recip();
+        // The variance of a mean under a memory that fades by this share from frame to frame.
+        (1.0 - memory.max(0.0)) / (1.0 + memory.max(0.0))
     }
 }
