@@ -231,7 +231,14 @@ fn bond(radio: &mut Radio, tag: TagAddress, passkey: Option<u32>) -> Result<bool
     let bond = radio.link.pair(tag, passkey).map_err(|error| {
         Failure::failed(error, "compare the passkey with the one printed on the tag; after a wrong one the tag makes every robot wait")
     })?;
-    bond.map_or(Ok(radio.link.keeps_bonds()), |bond| radio.keep(&bond))
+    match bond {
+        Some(bond) => radio.keep(&bond),
+        None if radio.link.keeps_bonds() => Ok(true),
+        None => Err(Failure::failed(
+            format!("tag {tag} keeps no key: it will not know this robot again"),
+            "pair once more; a tag that never keeps one needs other firmware",
+        )),
+    }
 }
 
 /// The tag of an object id or an address. One id on two tags is an error: one of them is not what
