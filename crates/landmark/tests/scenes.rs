@@ -226,6 +226,24 @@ fn what_is_the_request_itself_in_shorter_chips_is_no_rival() {
     assert!(frames.is_some_and(|f| f <= 30), "decided after {frames:?} frames");
 }
 
+/// Time stamps come from outside: a clock that jumps by ages must not end the robot.
+#[test]
+fn a_clock_that_jumps_by_ages_does_no_harm() {
+    let requests = [request("a", "1110010", 63.0), request("b", "110100100101", 40.0)];
+    for jump in [1u64 << 33, 1 << 45, 1 << 53, 1 << 62] {
+        let scene =
+            Scene { lights: vec![light(&requests[0], 20.3, 19.6, 30.0)], ..Scene::flat(40, 40) };
+        let mut finder = SequentialFinder::new(requests.to_vec(), Default::default()).unwrap();
+        let mut film = scene.film(1);
+        for k in 0..60 {
+            let mut frame = film.next_frame().unwrap();
+            frame.stamp += Duration::from_secs(if k < 20 { 0 } else { jump });
+            finder.push(&frame).unwrap();
+        }
+        finder.finish();
+    }
+}
+
 /// Patterns that are requested, played by somebody else at another rate.
 #[test]
 fn a_requested_pattern_at_another_rate_is_not_reported() {

@@ -18,6 +18,10 @@ pub fn light(pattern: &Pattern, times: &[(f64, f64)], phase: f64, rate: f64, out
     out.extend(times.iter().map(share));
 }
 
+/// Time (s) over which clock rates are told apart at most. A window that is longer has a jump of the
+/// camera's clock in it, and the number of rates must not grow with that.
+const LONGEST: f64 = 60.0;
+
 /// How long a pattern has been lit since its start, from a table: a bank asks for it hundreds of times a
 /// frame.
 #[derive(Debug, Clone)]
@@ -44,7 +48,8 @@ impl Lit {
     fn chips(&self, time: f64) -> f64 {
         let chips = time * self.pace;
         let periods = (chips / self.length) as i64 as f64;
-        let rest = (chips - periods * self.length).max(0.0);
+        // Time stamps may be anything: beyond what a float tells apart, the chip is arbitrary.
+        let rest = (chips - periods * self.length).clamp(0.0, self.length);
         let chip = rest as usize;
         let (before, after) = (self.before[chip], self.before[chip + 1]);
         periods * self.before[self.length as usize]
@@ -191,7 +196,7 @@ fn phase_step(pattern: &Pattern, times: &[(f64, f64)]) -> f64 {
 
 /// Clock rates close enough that the pattern stays within a quarter of a chip over `span` seconds.
 pub fn rates(pattern: &Pattern, tolerance: f64, span: f64) -> Vec<f64> {
-    let drift = tolerance * span / (PHASE_STEP * pattern.chip.as_secs_f64());
+    let drift = tolerance * span.min(LONGEST) / (PHASE_STEP * pattern.chip.as_secs_f64());
     let each_side = if drift > 0.5 { drift.ceil() as i64 } else { 0 };
     let rate = |k: i64| 1.0 + tolerance * k as f64 / each_side.max(1) as f64;
     (-each_side..=each_side).map(rate).collect()
@@ -271,4 +276,25 @@ fn spectrum(pattern: &Pattern) -> Vec<f64> {
     let largest = strengths.iter().copied().fold(1e-9, f64::max);
     strengths.iter_mut().for_each(|s| *s /= largest);
     strengths
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+
+    #[test]
+    fn the_table_says_what_the_pattern_says_and_takes_any_time() {
+        let pattern = Pattern::new("1110010".parse().unwrap(), Duration::from_millis(63)).unwrap();
+        let lit = Lit::new(&pattern);
+        for k in 0..500 {
+            let (time, span) = (0.0173 * f64::from(k), 0.001 * f64::from(1 + k % 40));
+            let (found, expected) = (lit.share(time, span), pattern.on_fraction(time, span));
+            assert!((found - expected).abs() < 1e-9, "{time} s: {found} is not {expected}");
+        }
+        for exponent in 9..300 {
+            let _ = lit.share(10f64.powi(exponent), 0.005);
+        }
+    }
 }

@@ -149,13 +149,15 @@ impl Lit<'_> {
 
     /// Every frame's first chip in a code of so many, and the share of its exposure there.
     fn chips(&self, clock: Clock, length: usize) -> impl Iterator<Item = (usize, f64)> {
-        let (middle, per_second, length) = (self.middle(), 1.0 / clock.chip, length as f64);
+        let (middle, per_second, last) = (self.middle(), 1.0 / clock.chip, length - 1);
+        let length = length as f64;
         self.times.iter().map(move |&(t, e)| {
             let from = (t - middle) * per_second + clock.offset;
             let (first, exposure) = (from.floor(), e * per_second);
             let rest = first + 1.0 - from;
             let share = if exposure <= rest { 1.0 } else { rest / exposure };
-            ((first - (first / length).floor() * length) as usize, share)
+            // Time stamps may be anything: beyond what a float tells apart, the chip is arbitrary.
+            (last.min((first - (first / length).floor() * length) as usize), share)
         })
     }
 
