@@ -39,6 +39,15 @@ impl Region {
     }
 }
 
+/// Where along a line the values of [`Level::across`] lie (px of the level from the given point).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Crossings {
+    /// Of the first value.
+    pub first: f64,
+    /// From value to value: 1 to 1.42.
+    pub step: f64,
+}
+
 /// The gradient of a region of a picture at one scale.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Level {
@@ -85,38 +94,49 @@ impl Level {
         ((u - self.origin.0 as f64 + 0.5) / s - 0.5, (v - self.origin.1 as f64 + 0.5) / s - 0.5)
     }
 
-    /// Smoothed grey values at `count` places from (x, y) on, each `step` further; not a number
-    /// where the level ends.
-    pub fn line(&self, (x, y): (f64, f64), step: (f64, f64), count: usize, out: &mut Vec<f32>) {
-        let last = (count - 1) as f64;
-        let whole = self.contains(x, y) && self.contains(x + step.0 * last, y + step.1 * last);
-        let (mut x, mut y) = (x as f32, y as f32);
-        let (dx, dy) = (step.0 as f32, step.1 as f32);
-        out.clear();
-        for _ in 0..count {
-            // A rectangle that holds both ends holds what lies between.
-            let inside = whole || self.contains(f64::from(x), f64::from(y));
-            out.push(if inside { self.value(x, y) } else { f32::NAN });
-            x += dx;
-            y += dy;
-        }
-    }
-
-    /// Whether a position is far enough inside for interpolation.
-    fn contains(&self, x: f64, y: f64) -> bool {
-        x >= 1.0 && y >= 1.0 && x < self.width() as f64 - 2.0 && y < self.height() as f64 - 2.0
-    }
-
-    /// Smoothed grey value at a position that the level contains, but for rounding.
-    fn value(&self, x: f32, y: f32) -> f32 {
-        let (x0, y0) = (x as i32, y as i32);
-        let (fx, fy) = (x - x0 as f32, y - y0 as f32);
+    /// Smoothed grey values along a line through (x, y), to `reach` (px of the level) and a little more on
+    /// either side, in `out`; not a number where the level ends. The values are taken where the line
+    /// crosses columns, or rows when it is steep: an upright edge is then sampled at pixel centres,
+    /// while values between them would shift it by up to a tenth of a pixel, all along.
+    pub fn across(
+        &self,
+        (x, y): (f64, f64),
+        (nx, ny): (f64, f64),
+        reach: f64,
+        out: &mut Vec<f32>,
+    ) -> Crossings {
         let width = self.width();
-        let i = y0 as usize * width + x0 as usize;
-        let square = &self.smooth.data()[i..i + width + 2];
-        let top = square[0] + fx * (square[1] - square[0]);
-        let bottom = square[width] + fx * (square[width + 1] - square[width]);
-        top + fy * (bottom - top)
+        let flat = nx.abs() >= ny.abs();
+        let (main, cross, along, lean) =
+            if flat { (x, y, nx, ny / nx) } else { (y, x, ny, nx / ny) };
+        let (size, cross_size, stride, cross_stride) = if flat {
+            (width, self.height(), 1, width)
+        } else {
+            (self.height(), width, width, 1)
+        };
+        let sense = along.signum();
+        let half = (reach * along.abs()).ceil() + 2.0;
+        let first = main.round() - sense * half;
+        let data = self.smooth.data();
+        let (mut at, mut place) = (first as i32, (cross + lean * (first - main)) as f32);
+        let (forward, slant) = (sense as i32, (sense * lean) as f32);
+        let (last, cross_last) = (size as i32 - 1, cross_size as f32 - 2.0);
+        out.clear();
+        for _ in 0..=2 * half as usize {
+            let inside = at >= 1 && at < last && place >= 1.0 && place < cross_last;
+            out.push(if inside {
+                let whole = place as usize;
+                let share = place - whole as f32;
+                let i = at as usize * stride + whole * cross_stride;
+                let (a, b) = (data[i], data[i + cross_stride]);
+                a + share * (b - a)
+            } else {
+                f32::NAN
+            });
+            at += forward;
+            place += slant;
+        }
+        Crossings { first: (first - main) / along, step: along.abs().recip() }
     }
 
     /// Derivatives along columns and rows: central differences, zero on the border.
