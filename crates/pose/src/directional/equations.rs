@@ -12,18 +12,17 @@
 //! away the edge is) is known better than where on the object the edge is.
 //!
 //! Two variances are estimated on the way: the scatter of a part's edges in a view (print, clutter
-//! and noise make some edges far worse than others), and the offset of a part (heavy tails, as of a
-//! Student's t: a part that is seen to be far off may well be).
+//! and noise make some edges far worse than others), and the offsets of a part (heavy tails, as of a
+//! Student's t: a part that is seen to be far off may well be, on the object or in one view only,
+//! where a shadow or another object ends beside it).
 
 use multiversion::multiversion;
-use nalgebra::{Matrix4, Matrix6, RowVector4, SMatrix, SVector, Vector2, Vector4};
+use nalgebra::{Matrix4, Matrix6, SMatrix, SVector, Vector2, Vector4};
 
-use super::sites::Site;
+use super::sites::{ByShared, SHARED, Site};
 
-/// Unknowns that all views share: the pose's tangent and the logarithm of the size.
-const SHARED: usize = 7;
-/// Unknowns of each view.
-const OWN: usize = 4;
+/// Unknowns of each view: small turns of its camera.
+const OWN: usize = 2;
 /// Views at most: what has a fixed size is fast.
 pub(super) const VIEWS: usize = 2;
 /// All unknowns, and those of one part: its offset and tilt (m), its offset in each view (px).
@@ -44,6 +43,8 @@ const SCATTER_SHARE: f64 = 0.3;
 const SCATTER_PRIOR: f64 = 1.5;
 /// Degrees of freedom of the parts' offsets.
 pub(super) const OFFSET_TAIL: f64 = 2.0;
+/// The same of what one view sees beside that.
+const VIEW_TAIL: f64 = 3.0;
 
 /// Changes of the unknowns.
 #[derive(Clone)]
@@ -51,7 +52,7 @@ pub(super) struct Move {
     /// Of those all views share.
     pub shared: SVector<f64, SHARED>,
     /// Of each view's own.
-    pub own: Vec<Vector4<f64>>,
+    pub own: Vec<Vector2<f64>>,
 }
 
 /// One measurement of a site.
@@ -59,7 +60,7 @@ struct Edge {
     /// Part and kind, piece, view.
     key: (u32, u32, usize),
     by_shared: SVector<f64, SHARED>,
-    by_own: Vector4<f64>,
+    by_own: Vector2<f64>,
     /// Against a site with one edge of good contrast.
     weight: f64,
     residual: f64,
@@ -103,12 +104,12 @@ impl Equations {
     }
 
     /// Adds the measurement of a site.
-    pub fn edge(&mut self, site: &Site, by_own: &RowVector4<f64>, weight: f64, residual: f64) {
+    pub fn edge(&mut self, site: &Site, by_shared: &ByShared, weight: f64, residual: f64) {
         let part = 3 * u32::from(site.part) + site.kind as u32;
         self.edges.push(Edge {
             key: (part, (site.along / PIECE) as u32, site.view),
-            by_shared: site.by_pose.transpose(),
-            by_own: by_own.transpose(),
+            by_shared: by_shared.transpose(),
+            by_own: site.by_turn.transpose(),
             weight,
             residual,
             scale: site.px_per_metre,
@@ -118,17 +119,17 @@ impl Equations {
 
     /// Turns the sites into equations, without what only the parts' own offsets explain; to be
     /// called once all sites are in. `offsets` are the parts' offsets as last seen.
-    pub fn share_errors(&mut self, offsets: &[(u32, f64)]) {
+    pub fn share_errors(&mut self, offsets: &[Offsets]) {
         let edges = std::mem::take(&mut self.edges);
         let mut sorted: Vec<&Edge> = edges.iter().collect();
         sorted.sort_by_key(|e| e.key);
         for part in sorted.chunk_by(|a, b| a.key.0 == b.key.0) {
-            let known = offsets.iter().find(|o| o.0 == part[0].key.0);
-            self.part(part, known.map_or(0.0, |o| o.1));
+            let known = offsets.iter().find(|o| o.part == part[0].key.0);
+            self.part(part, known.copied().unwrap_or_default());
         }
     }
 
-    fn part(&mut self, edges: &[&Edge], offset: f64) {
+    fn part(&mut self, edges: &[&Edge], seen: Offsets) {
         let scatter: [f64; VIEWS] = std::array::from_fn(|v| self.scatter(edges, v));
         let (first, last) = (edges[0].key.1, edges[edges.len() - 1].key.1);
         let mut a = SMatrix::<f64, WITH_PART, WITH_PART>::zeros();
@@ -169,14 +170,16 @@ impl Equations {
             b.axpy(-share * moment, &of_piece, 1.0);
         }
         // Heavy tails: a part that was seen to be off by much may well be off by much.
-        let variance =
-            (OFFSET_TAIL * edges[0].offset_sd.powi(2) + offset.powi(2)) / (OFFSET_TAIL + 1.0);
+        let tailed =
+            |variance: f64, seen: f64, tail: f64| (tail * variance + seen * seen) / (tail + 1.0);
+        let variance = tailed(edges[0].offset_sd.powi(2), seen.shared, OFFSET_TAIL);
         let doubt = self.doubt * self.doubt;
         let mut inner = a.fixed_view::<PART, PART>(ALL, ALL).into_owned();
         inner[(0, 0)] += (doubt * variance).recip();
         inner[(1, 1)] += (doubt * TILT_SD * TILT_SD).recip();
         for (v, scatter) in scatter.iter().enumerate() {
             let view = VIEW_SD_PX * VIEW_SD_PX + SCATTER_SHARE * SCATTER_SHARE * scatter;
+            let view = tailed(view, seen.own_px[v], VIEW_TAIL);
             inner[(2 + v, 2 + v)] += (doubt * view).recip();
         }
         let Some(inverse) = inner.try_inverse() else { return };
@@ -204,7 +207,7 @@ impl Equations {
         &mut self,
         view: usize,
         js: &SVector<f64, SHARED>,
-        jo: &Vector4<f64>,
+        jo: &Vector2<f64>,
         weight: f64,
         residual: f64,
     ) {
@@ -224,12 +227,12 @@ impl Equations {
         rhs += b;
     }
 
-    /// Adds a prior on a view's own unknowns: their precision and what is missing to their means.
-    pub fn own(&mut self, view: usize, precision: &Vector4<f64>, missing: &Vector4<f64>) {
+    /// Adds a prior on a view's turns: their precision and what is missing to zero.
+    pub fn own(&mut self, view: usize, precision: f64, missing: &Vector2<f64>) {
         let at = SHARED + OWN * view;
         for k in 0..OWN {
-            self.a[(at + k, at + k)] += precision[k];
-            self.b[at + k] += precision[k] * missing[k];
+            self.a[(at + k, at + k)] += precision;
+            self.b[at + k] += precision * missing[k];
         }
     }
 
@@ -256,8 +259,11 @@ impl Equations {
         let covariance = factor.solve(&unit).fixed_view::<6, 6>(0, 0).into_owned();
         let own = (0..self.views).map(|v| x.fixed_rows::<OWN>(SHARED + OWN * v).into_owned());
         let step = Move { shared: x.fixed_rows::<SHARED>(0).into_owned(), own: own.collect() };
-        let offset = |p: &Eliminated| (p.inverse * (p.rhs - p.mixed.tr_mul(&x)))[0];
-        let offsets = self.parts.iter().map(|p| (p.part, offset(p))).collect();
+        let offsets = self.parts.iter().map(|p| {
+            let own = p.inverse * (p.rhs - p.mixed.tr_mul(&x));
+            Offsets { part: p.part, shared: own[0], own_px: std::array::from_fn(|v| own[2 + v]) }
+        });
+        let offsets = offsets.collect();
         Some(Solution { step, covariance, offsets })
     }
 }
@@ -275,12 +281,23 @@ fn add_outer(a: &mut SMatrix<f64, WITH_PART, WITH_PART>, weight: f64, v: &SVecto
     }
 }
 
+/// How far off the edges of a part are.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Offsets {
+    /// Part and kind.
+    part: u32,
+    /// In all views, on the object (m).
+    shared: f64,
+    /// In each view beside that (px).
+    own_px: [f64; VIEWS],
+}
+
 /// What the equations give.
 pub(super) struct Solution {
     /// Changes of the unknowns.
     pub step: Move,
     /// Covariance of the pose's tangent.
     pub covariance: Matrix6<f64>,
-    /// Offsets of the parts on the object (m).
-    pub offsets: Vec<(u32, f64)>,
+    /// How far off the parts are.
+    pub offsets: Vec<Offsets>,
 }

@@ -69,7 +69,7 @@ impl Level {
         let smooth = kernel::gaussian_blur(&reduced, SMOOTHING_PX);
         // White noise of deviation s through a Gaussian derivative: s / (sqrt(8 pi) sigma^2), and
         // the central difference smooths a little more.
-        let gain = 1.0 / ((8.0 * std::f32::consts::PI).sqrt() * (SMOOTHING_PX.powi(2) + 0.15));
+        let gain = 1.0 / ((8.0 * std::f32::consts::PI).sqrt() * ((SMOOTHING_PX).powi(2) + 0.15));
         Level {
             scale,
             origin: (region.left, region.top),
@@ -109,11 +109,8 @@ impl Level {
         let flat = nx.abs() >= ny.abs();
         let (main, cross, along, lean) =
             if flat { (x, y, nx, ny / nx) } else { (y, x, ny, nx / ny) };
-        let (size, cross_size, stride, cross_stride) = if flat {
-            (width, self.height(), 1, width)
-        } else {
-            (self.height(), width, width, 1)
-        };
+        let (size, cross_size, stride, cross_stride) =
+            if flat { (width, self.height(), 1, width) } else { (self.height(), width, width, 1) };
         let sense = along.signum();
         let half = (reach * along.abs()).ceil() + 2.0;
         let first = main.round() - sense * half;

@@ -71,7 +71,7 @@ impl Search<'_> {
 fn contour_metric(refined: &Refined) -> Matrix6<f64> {
     let mut metric = Matrix6::zeros();
     for site in &refined.sites {
-        let j = site.by_pose.fixed_columns::<6>(0);
+        let j = site.by_shared.fixed_columns::<6>(0);
         metric += j.transpose() * j;
     }
     metric / refined.sites.len().max(1) as f64

@@ -6,18 +6,18 @@
 //! (annealing). The landmark is a measurement of three numbers with its covariance.
 //!
 //! Nuisance unknowns with priors take up what would else bias the pose: the object's size is not
-//! exactly the record's, the cameras' angles are known to the servos' accuracy, and silhouettes
-//! appear a fraction of a pixel off (rounded edges, blooming, gamma). Those that belong to one view
-//! are eliminated view by view (Schur complement). The foot of a standing object, where the shadow
-//! begins, is measured only coarsely.
+//! exactly the record's, silhouettes appear a fraction of a pixel off (rounded edges, blooming,
+//! gamma), lips have some thickness, all in every view alike; and each camera's angles are known to
+//! the servos' accuracy. The foot of a standing object, where the shadow begins, is measured only
+//! coarsely.
 
-use nalgebra::{Matrix3, Matrix6, Point3, RowVector4, SMatrix, SVector, Vector2, Vector3, Vector4};
+use nalgebra::{Matrix2, Matrix3, Matrix6, Point3, SMatrix, SVector, Vector2, Vector3};
 use vergence_geometry::Transform;
 use vergence_geometry::gaussian::{perturb, skew};
 
-use super::equations::{Equations, Move};
+use super::equations::{Equations, Move, Offsets};
 use super::search::Search;
-use super::sites::{Layout, Nuisance, Site, State, sites};
+use super::sites::{Form, Layout, SHARED, Site, State, sites};
 use crate::model::Kind;
 
 /// Standard deviation of an edge's place once the pose is right (px): aliasing, gamma, blooming and
@@ -53,6 +53,8 @@ const LANDMARK_SD_PX: f64 = 0.3;
 /// Thickness of the lip of an open rim (m), and its deviation.
 const LIP: f64 = 0.003;
 const LIP_SD: f64 = 0.0015;
+/// Where the lip is among the shared unknowns.
+const LIP_AT: usize = SHARED - 1;
 /// Deviation of the swelling of silhouettes (px).
 const SWELL_SD_PX: f64 = 0.4;
 /// Deviation of the logarithm of the object's size: one percent.
@@ -98,14 +100,14 @@ impl Pass {
 pub struct Refined {
     /// `base_from_object`.
     pub pose: Transform,
-    /// Logarithm of the object's size against the record's.
-    pub log_size: f64,
-    /// Each view's own unknowns.
-    pub nuisances: Vec<Nuisance>,
+    /// How the object differs from its record.
+    pub form: Form,
+    /// Small turns of each view's camera about its own x and y axes (rad).
+    pub turns: Vec<Vector2<f64>>,
     /// Covariance of the pose's tangent as the information has it.
     pub covariance: Matrix6<f64>,
-    /// How far off the parts of the object seem to be from where the record has them (m).
-    pub offsets: Vec<(u32, f64)>,
+    /// How far off the parts of the object seem to be from where the record has them.
+    pub offsets: Vec<Offsets>,
     /// What the priors hold against this state: half their squared normalised residuals.
     pub strain: f64,
     /// The hypothesis that it comes from rests on something level: it stays so while it is refined,
@@ -115,8 +117,8 @@ pub struct Refined {
     pub sites: Vec<Site>,
 }
 
-type Matrix7 = SMatrix<f64, 7, 7>;
-type Vector7 = SVector<f64, 7>;
+type SharedMatrix = SMatrix<f64, SHARED, SHARED>;
+type SharedVector = SVector<f64, SHARED>;
 
 impl Search<'_> {
     /// Refines a state through the given passes.
@@ -125,7 +127,8 @@ impl Search<'_> {
         for pass in passes {
             self.lay_out(refined, pass);
             // Three steps on the same sites: the assignments settle while the geometry is linear.
-            let mut moved = Move { shared: Vector7::zeros(), own: vec![Vector4::zeros(); views] };
+            let mut moved =
+                Move { shared: SharedVector::zeros(), own: vec![Vector2::zeros(); views] };
             for _ in 0..3 {
                 let Some(step) = self.step(refined, pass, &moved, 1.0) else { break };
                 moved.shared += step.shared;
@@ -140,7 +143,7 @@ impl Search<'_> {
     pub fn doubt(&self, refined: &mut Refined, pass: &Pass) {
         self.lay_out(refined, pass);
         let views = self.sights.len();
-        let still = Move { shared: Vector7::zeros(), own: vec![Vector4::zeros(); views] };
+        let still = Move { shared: SharedVector::zeros(), own: vec![Vector2::zeros(); views] };
         self.step(refined, pass, &still, DOUBT);
     }
 
@@ -153,11 +156,8 @@ impl Search<'_> {
                 Some(fine) if pass.fine => fine,
                 _ => &sight.coarse,
             };
-            let state = State {
-                pose: &refined.pose,
-                log_size: refined.log_size,
-                nuisance: refined.nuisances[view],
-            };
+            let state =
+                State { pose: &refined.pose, form: refined.form, turn: refined.turns[view] };
             let up = self.query.up;
             sites(&mut found, sight, view, level, self.model, &state, up, &pass.layout);
         }
@@ -168,14 +168,12 @@ impl Search<'_> {
     fn step(&self, refined: &mut Refined, pass: &Pass, moved: &Move, doubt: f64) -> Option<Move> {
         let mut equations = Equations::new(self.sights.len(), pass.sd_px, doubt);
         for site in &refined.sites {
-            let own = &moved.own[site.view];
-            let by_own =
-                RowVector4::new(site.by_nuisance.x, site.by_nuisance.y, site.by_nuisance.z, 0.0);
-            let shift = (site.by_pose * moved.shared).x + (by_own * own).x;
-            let by_lip = site.by_nuisance.w;
-            for (inner, weight, residual) in assign(site, shift, by_lip * own.w, pass.sd_px) {
-                let by_own = if inner { site.by_nuisance } else { by_own };
-                equations.edge(site, &by_own, weight, residual);
+            let shift = (site.by_shared * moved.shared).x + (site.by_turn * moved.own[site.view]).x;
+            let lip_shift = site.by_lip * moved.shared[LIP_AT];
+            for (inner, weight, residual) in assign(site, shift, lip_shift, pass.sd_px) {
+                let mut by_shared = site.by_shared;
+                by_shared[LIP_AT] = if inner { site.by_lip } else { 0.0 };
+                equations.edge(site, &by_shared, weight, residual);
             }
         }
         equations.share_errors(&refined.offsets);
@@ -187,8 +185,7 @@ impl Search<'_> {
             if let Some((residual, by_shared, by_own)) = self.landmark_pixel(&now, view) {
                 equations.pixel(view, &by_shared, &by_own, LANDMARK_SD_PX.powi(-2), &residual);
             }
-            let precision = self.nuisance_precision(view);
-            equations.own(view, &precision, &(usual() - now.nuisances[view]));
+            equations.own(view, self.turn_precision(view), &-now.turns[view]);
         }
         let solution = equations.solve()?;
         refined.covariance = solution.covariance;
@@ -196,17 +193,16 @@ impl Search<'_> {
         Some(solution.step)
     }
 
-    fn nuisance_precision(&self, view: usize) -> Vector4<f64> {
+    fn turn_precision(&self, view: usize) -> f64 {
         // An exactly known angle still gets a nanoradian, so that one formula serves.
-        let turn = self.sights[view].view.turn_sd.max(1e-9).powi(-2);
-        Vector4::new(turn, turn, SWELL_SD_PX.powi(-2), LIP_SD.powi(-2))
+        self.sights[view].view.turn_sd.max(1e-9).powi(-2)
     }
 
     /// Residual of the landmark (m) and its derivative by the shared unknowns.
-    fn landmark_residual(&self, state: &Refined) -> (Vector3<f64>, SMatrix<f64, 3, 7>) {
-        let lever = state.pose.rotation * self.landmark * state.log_size.exp();
+    fn landmark_residual(&self, state: &Refined) -> (Vector3<f64>, SMatrix<f64, 3, SHARED>) {
+        let lever = state.pose.rotation * self.landmark * state.form.x.exp();
         let centre = state.pose.translation.vector;
-        let mut j = SMatrix::<f64, 3, 7>::zeros();
+        let mut j = SMatrix::<f64, 3, SHARED>::zeros();
         j.fixed_view_mut::<3, 3>(0, 0).copy_from(&-skew(&lever));
         j.fixed_view_mut::<3, 3>(0, 3).copy_from(&Matrix3::identity());
         j.fixed_view_mut::<3, 1>(0, 6).copy_from(&lever);
@@ -224,28 +220,25 @@ impl Search<'_> {
         &self,
         state: &Refined,
         view: usize,
-    ) -> Option<(Vector2<f64>, SMatrix<f64, 2, 7>, SMatrix<f64, 2, 4>)> {
+    ) -> Option<(Vector2<f64>, SMatrix<f64, 2, SHARED>, Matrix2<f64>)> {
         if !self.landmark_is_pixels() {
             return None;
         }
         let sight = &self.sights[view];
         let seen = sight.optical_from_base * self.query.landmark.position;
         let seen = sight.view.camera.project(&seen)?;
-        let turn = state.nuisances[view];
-        let turned = Transform::rotation(Vector3::new(turn.x, turn.y, 0.0));
+        let turned = Transform::rotation(state.turns[view].push(0.0));
         let optical_from_base = turned * sight.optical_from_base;
-        let lever = state.pose.rotation * self.landmark * state.log_size.exp();
+        let lever = state.pose.rotation * self.landmark * state.form.x.exp();
         let p = optical_from_base * Point3::from(state.pose.translation.vector + lever);
         let (pixel, by_point) = sight.view.camera.project_with_jacobian(&p)?;
         let by_base = by_point * optical_from_base.rotation.to_rotation_matrix();
-        let mut by_shared = SMatrix::<f64, 2, 7>::zeros();
+        let mut by_shared = SMatrix::<f64, 2, SHARED>::zeros();
         by_shared.fixed_view_mut::<2, 3>(0, 0).copy_from(&(by_base * -skew(&lever)));
         by_shared.fixed_view_mut::<2, 3>(0, 3).copy_from(&by_base);
         by_shared.fixed_view_mut::<2, 1>(0, 6).copy_from(&(by_base * lever));
         let by_turn = by_point * -skew(&p.coords);
-        let mut by_own = SMatrix::<f64, 2, 4>::zeros();
-        by_own.fixed_view_mut::<2, 2>(0, 0).copy_from(&by_turn.fixed_view::<2, 2>(0, 0));
-        Some((seen - pixel, by_shared, by_own))
+        Some((seen - pixel, by_shared, by_turn.fixed_columns::<2>(0).into_owned()))
     }
 
     /// What the landmark's measurement is worth as a point (1/m^2).
@@ -255,7 +248,7 @@ impl Search<'_> {
     }
 
     /// Information and right-hand side of the landmark, of gravity and of the size.
-    fn prior(&self, state: &Refined) -> (Matrix7, Vector7) {
+    fn prior(&self, state: &Refined) -> (SharedMatrix, SharedVector) {
         let (residual, j) = self.landmark_residual(state);
         let weight = self.landmark_weight();
         let (mut a, mut b) = (j.transpose() * weight * j, j.transpose() * weight * residual);
@@ -268,10 +261,12 @@ impl Search<'_> {
             let mut rhs = b.fixed_rows_mut::<3>(0);
             rhs += tilts * turn;
         }
-        a[(6, 6)] += SIZE_SD.powi(-2);
-        b[6] -= state.log_size * SIZE_SD.powi(-2);
+        for (k, (sd, off)) in form_sd().iter().zip(&(state.form - usual())).enumerate() {
+            a[(6 + k, 6 + k)] += sd.powi(-2);
+            b[6 + k] -= off * sd.powi(-2);
+        }
         // A solid of revolution says nothing about one turn: hold it.
-        a += Matrix7::identity() * 1e-3;
+        a += SharedMatrix::identity() * 1e-3;
         (a, b)
     }
 
@@ -280,23 +275,20 @@ impl Search<'_> {
         let (residual, _) = self.landmark_residual(state);
         let weight = self.landmark_weight();
         let landmark = (residual.transpose() * weight * residual).x;
-        let size = (state.log_size / SIZE_SD).powi(2);
+        let form = (state.form - usual()).component_div(&form_sd()).norm_squared();
         let tilt = match self.tilt(state) {
             Some(turn) => (turn.norm() / STANDING_SD).powi(2),
             None if self.query.up.is_some() && self.query.standing.is_none() => 2.0 * UNSUPPORTED,
             None => 0.0,
         };
-        let own: f64 = (0..state.nuisances.len())
-            .map(|v| {
-                let n = state.nuisances[v] - usual();
-                n.component_mul(&n).dot(&self.nuisance_precision(v))
-            })
+        let turns: f64 = (0..state.turns.len())
+            .map(|v| self.turn_precision(v) * state.turns[v].norm_squared())
             .sum();
-        let pixels: f64 = (0..state.nuisances.len())
+        let pixels: f64 = (0..state.turns.len())
             .filter_map(|v| self.landmark_pixel(state, v))
             .map(|(residual, ..)| (residual / LANDMARK_SD_PX).norm_squared())
             .sum();
-        0.5 * (landmark + size + tilt + own + pixels)
+        0.5 * (landmark + form + tilt + turns + pixels)
     }
 
     /// The small turn (base frame) that would make the object stand exactly, when it seems to.
@@ -324,8 +316,8 @@ impl Refined {
         Refined {
             pose: *pose,
             rests,
-            log_size: 0.0,
-            nuisances: vec![usual(); views],
+            form: usual(),
+            turns: vec![Vector2::zeros(); views],
             covariance: Matrix6::identity(),
             offsets: Vec::new(),
             strain: 0.0,
@@ -335,26 +327,23 @@ impl Refined {
 
     fn apply(&mut self, moved: &Move) {
         self.pose = perturb(&self.pose, &moved.shared.fixed_rows::<6>(0).into_owned());
-        self.log_size += moved.shared[6];
-        for (nuisance, step) in self.nuisances.iter_mut().zip(&moved.own) {
-            *nuisance += step;
-        }
+        self.form += moved.shared.fixed_rows::<3>(6);
+        self.turns.iter_mut().zip(&moved.own).for_each(|(turn, step)| *turn += step);
     }
 
     /// The unknowns without the sites.
     fn clone_state(&self) -> Self {
-        Refined {
-            sites: Vec::new(),
-            offsets: Vec::new(),
-            nuisances: self.nuisances.clone(),
-            ..*self
-        }
+        Refined { sites: Vec::new(), offsets: Vec::new(), turns: self.turns.clone(), ..*self }
     }
 }
 
-/// What a view's own unknowns are expected to be.
-fn usual() -> Nuisance {
-    Nuisance::new(0.0, 0.0, 0.0, LIP)
+/// What the form is expected to be, and by how much it deviates.
+fn usual() -> Form {
+    Form::new(0.0, 0.0, LIP)
+}
+
+fn form_sd() -> Form {
+    Form::new(SIZE_SD, SWELL_SD_PX, LIP_SD)
 }
 
 /// Measurements of a site whose contour has moved by `shift`, the inner edge of its lip by another

@@ -6,7 +6,7 @@
 //! and shadows to feet, so the nearest or the strongest edge is often the wrong one; the refinement
 //! weighs them all.
 
-use nalgebra::{Matrix3, Point3, RowVector4, Unit, Vector3, Vector4};
+use nalgebra::{Matrix3, Point3, RowSVector, RowVector2, Unit, Vector2, Vector3};
 use vergence_geometry::{Transform, gaussian::skew};
 
 use super::level::Level;
@@ -18,7 +18,7 @@ use crate::model::{Contour, Kind, Model};
 /// Outline where a face ends: rounded edges, seams, bulging sides.
 const FORM_SD: f64 = 0.0004;
 /// Outline of a curved wall: it darkens towards where it turns away.
-const LIMB_SD: f64 = 0.0007;
+const LIMB_SD: f64 = 0.0004;
 /// Edge between two visible faces: where a rounded edge seems to be depends on the light.
 const CREASE_SD: f64 = 0.0006;
 /// Open rim: rolled or rounded lips.
@@ -52,14 +52,16 @@ pub struct Candidate {
     pub slope: f32,
 }
 
-/// How a site's contour moves across itself by the global unknowns: the pose's tangent (rad, m)
-/// and the logarithm of the object's size.
-pub type ByPose = nalgebra::RowSVector<f64, 7>;
+/// Unknowns that all views share: the pose's tangent (rad, m), then the [`Form`].
+pub const SHARED: usize = 9;
 
-/// What one view's measurements share: small turns of the camera about its own x and y axes (rad),
-/// how far its silhouettes swell outwards (px; blooming, gamma, rounded edges), and how thick the
-/// lip of an open rim appears (m).
-pub type Nuisance = Vector4<f64>;
+/// How a site's contour moves across itself by the shared unknowns.
+pub type ByShared = RowSVector<f64, SHARED>;
+
+/// How the object differs from its record, in all views alike: the logarithm of its size, how far
+/// silhouettes swell outwards (px; blooming, gamma, rounded edges), and how thick the lip of an open
+/// rim is (m). Views that swell on their own would shift the object in depth.
+pub type Form = Vector3<f64>;
 
 /// A place on the contour.
 #[derive(Debug, Clone, PartialEq)]
@@ -84,10 +86,12 @@ pub struct Site {
     pub px_per_metre: f64,
     /// The foot of a standing object, where its shadow begins.
     pub contact: bool,
-    /// Shift of the contour along the normal by the global unknowns (px per unit).
-    pub by_pose: ByPose,
-    /// The same by the view's own unknowns.
-    pub by_nuisance: RowVector4<f64>,
+    /// Shift of the contour along the normal by the shared unknowns (px per unit), the lip's aside.
+    pub by_shared: ByShared,
+    /// Shift of the lip's inner edge by its thickness (px per m).
+    pub by_lip: f64,
+    /// Shift by small turns of the camera about its own x and y axes (px per rad).
+    pub by_turn: RowVector2<f64>,
     /// Where the inner edge of an open rim would be (px along the normal); the outer is at zero.
     pub inner: Option<f64>,
     /// The edges, `count` of them.
@@ -134,10 +138,10 @@ pub struct Layout {
 pub struct State<'a> {
     /// `base_from_object`.
     pub pose: &'a Transform,
-    /// Logarithm of the object's size against the record's.
-    pub log_size: f64,
-    /// The view's own unknowns.
-    pub nuisance: Nuisance,
+    /// How it differs from its record.
+    pub form: Form,
+    /// Small turns of the camera about its own x and y axes (rad).
+    pub turn: Vector2<f64>,
 }
 
 /// Appends the sites of one view.
@@ -152,9 +156,8 @@ pub fn sites(
     layout: &Layout,
 ) {
     let pose = state.pose;
-    let size = state.log_size.exp();
-    let swell = state.nuisance.z;
-    let turned = Transform::rotation(Vector3::new(state.nuisance.x, state.nuisance.y, 0.0));
+    let size = state.form.x.exp();
+    let turned = Transform::rotation(state.turn.push(0.0));
     let optical_from_object = turned * sight.optical_from_base * pose;
     let optical_from_base = optical_from_object.rotation * pose.rotation.inverse();
     let optical_from_base: Matrix3<f64> = optical_from_base.to_rotation_matrix().into_inner();
@@ -198,17 +201,17 @@ pub fn sites(
                 normal = -normal;
             }
             let swells = segment.kind == Kind::Silhouette && !contact;
-            let pixel = if swells { pixel + normal.transpose() * swell } else { pixel };
+            let pixel = if swells { pixel + normal.transpose() * state.form.y } else { pixel };
             let across = normal * by_point;
             let by_base = across * optical_from_base;
             let lever = pose.rotation * in_object;
             let by_rotation = by_base * -skew(&lever);
             let by_camera = across * -skew(&p.coords);
-            let mut by_pose = ByPose::zeros();
-            by_pose.fixed_columns_mut::<3>(0).copy_from(&by_rotation);
-            by_pose.fixed_columns_mut::<3>(3).copy_from(&by_base);
-            by_pose[6] = (by_base * lever).x;
-            let by_swell = if swells { 1.0 } else { 0.0 };
+            let mut by_shared = ByShared::zeros();
+            by_shared.fixed_columns_mut::<3>(0).copy_from(&by_rotation);
+            by_shared.fixed_columns_mut::<3>(3).copy_from(&by_base);
+            by_shared[6] = (by_base * lever).x;
+            by_shared[7] = if swells { 1.0 } else { 0.0 };
             let towards_axis = -Vector3::new(in_object.x, in_object.y, 0.0);
             let by_lip = match (segment.kind, towards_axis.try_normalize(1e-9)) {
                 (Kind::Rim, Some(inwards)) => (by_base * (pose.rotation * inwards)).x,
@@ -225,9 +228,10 @@ pub fn sites(
                 length: length / n as f64,
                 px_per_metre: camera.fx / p.z,
                 contact,
-                by_pose,
-                by_nuisance: RowVector4::new(by_camera.x, by_camera.y, by_swell, by_lip),
-                inner: (segment.kind == Kind::Rim).then_some(by_lip * state.nuisance.w),
+                by_shared,
+                by_lip,
+                by_turn: RowVector2::new(by_camera.x, by_camera.y),
+                inner: (segment.kind == Kind::Rim).then_some(by_lip * state.form.z),
                 candidates: Default::default(),
                 count: 0,
             };
@@ -276,7 +280,7 @@ fn find_edges(site: &mut Site, level: &Level, range_px: f64, profile: &mut Vec<f
         insert(site, Candidate { offset, weight, noise_px, slope: sign * height });
     }
     for candidate in &mut site.candidates[..site.count] {
-        candidate.weight = 0.3 + 0.7 * candidate.weight / f64::from(strongest);
+        candidate.weight = 0.3 + (1.0 - 0.3) * candidate.weight / f64::from(strongest);
     }
 }
 

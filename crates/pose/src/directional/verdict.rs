@@ -147,8 +147,8 @@ fn likelihoods(site: &Site, sd_px: f64, scale: f64) -> [[f64; GRID]; 2] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::directional::sites::{ByPose, Candidate};
-    use nalgebra::RowVector4;
+    use crate::directional::sites::{ByShared, Candidate};
+    use nalgebra::RowVector2;
 
     /// Forty sites of one part with an edge each, at these offsets (px) and slopes.
     fn part(edge: impl Fn(usize) -> (f64, f32)) -> Vec<Site> {
@@ -166,8 +166,9 @@ mod tests {
                 length: 2.0,
                 px_per_metre: 1000.0,
                 contact: false,
-                by_pose: ByPose::zeros(),
-                by_nuisance: RowVector4::zeros(),
+                by_shared: ByShared::zeros(),
+                by_lip: 0.0,
+                by_turn: RowVector2::zeros(),
                 inner: None,
                 candidates: [found, Candidate::default(), found, found],
                 count: 1,
