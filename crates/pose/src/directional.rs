@@ -34,6 +34,12 @@ use verdict::Explained;
 const SURE_FINALISTS: usize = 3;
 const BEHIND: f64 = 15.0;
 
+/// Smoothing before the search's edges (px of the working scale): enough to average noise.
+const SEARCH_BLUR_PX: f32 = 0.7;
+/// Smoothing before edges are placed (px): hardly any, or neighbouring edges shift each other. Noise
+/// is averaged along the contour instead, where nothing else is lost.
+const PLACE_BLUR_PX: f32 = 0.35;
+
 /// Alternatives reported.
 const MOST_ALTERNATIVES: usize = 4;
 
@@ -200,8 +206,8 @@ fn prepare<'a>(
             }
             let (width, height) = (view.image.width(), view.image.height());
             let region = Region::around((pixel.x, pixel.y), reach_px, width, height)?;
-            let coarse = Level::new(view.image, &region, scale);
-            let fine = (scale > 1).then(|| Level::new(view.image, &region, 1));
+            let coarse = Level::new(view.image, &region, scale, SEARCH_BLUR_PX);
+            let fine = Level::new(view.image, &region, 1, PLACE_BLUR_PX);
             let field = if search {
                 Field::new(&edges::edgels(&coarse), coarse.width(), coarse.height())
             } else {

@@ -23,7 +23,7 @@ pub struct Edgel {
 /// The edge points of a level.
 pub fn edgels(level: &Level) -> Vec<Edgel> {
     let (width, height) = (level.width(), level.height());
-    let threshold2 = (NOISE_FACTOR * level.noise).powi(2);
+    let threshold2 = (NOISE_FACTOR * level.slope_noise).powi(2);
     let (gx, gy) = level.slopes();
     let (gx, gy) = (gx.data(), gy.data());
     let magnitude: Vec<f32> = gx.iter().zip(gy).map(|(gx, gy)| gx * gx + gy * gy).collect();

@@ -7,9 +7,6 @@
 
 use vergence_imaging::{Image, kernel};
 
-/// Standard deviation of the smoothing before the derivative (px of the level): wide enough to
-/// average noise, narrow enough to keep edges two pixels apart.
-const SMOOTHING_PX: f32 = 0.7;
 /// A gradient's noise is never taken to be lower (grey levels per pixel): quantisation.
 const NOISE_FLOOR: f32 = 0.12;
 
@@ -57,24 +54,29 @@ pub struct Level {
     pub origin: (usize, usize),
     /// The smoothed picture (grey levels).
     pub smooth: Image<f32>,
-    /// Standard deviation of a derivative of it (grey levels per level pixel) where there is nothing but noise.
-    pub noise: f32,
+    /// Standard deviation of a central difference of it (grey levels per level pixel) where there is
+    /// nothing but noise.
+    pub slope_noise: f32,
+    /// The same of a difference of two neighbours.
+    pub step_noise: f32,
 }
 
 impl Level {
     /// Works out one level of a picture.
-    pub fn new(image: &Image<u8>, region: &Region, scale: usize) -> Self {
+    pub fn new(image: &Image<u8>, region: &Region, scale: usize, smoothing_px: f32) -> Self {
         let reduced = reduce(image, region, scale);
         let noise = grey_noise(&reduced);
-        let smooth = kernel::gaussian_blur(&reduced, SMOOTHING_PX);
-        // White noise of deviation s through a Gaussian derivative: s / (sqrt(8 pi) sigma^2), and
-        // the central difference smooths a little more.
-        let gain = 1.0 / ((8.0 * std::f32::consts::PI).sqrt() * ((SMOOTHING_PX).powi(2) + 0.15));
+        let taps = kernel::gaussian_taps(smoothing_px);
+        let smooth = kernel::convolve_separable(&reduced, &taps);
+        // White noise through the taps, then the difference of two neighbours.
+        let at_lag = |lag: usize| taps.iter().zip(&taps[lag..]).map(|(a, b)| a * b).sum::<f32>();
+        let gain = |lag: usize| (2.0 * at_lag(0) * (at_lag(0) - at_lag(lag))).sqrt();
         Level {
             scale,
             origin: (region.left, region.top),
             smooth,
-            noise: (noise * gain).max(NOISE_FLOOR),
+            slope_noise: (noise * 0.5 * gain(2)).max(NOISE_FLOOR),
+            step_noise: (noise * gain(1)).max(NOISE_FLOOR),
         }
     }
 

@@ -152,10 +152,7 @@ impl Search<'_> {
         let mut found = std::mem::take(&mut refined.sites);
         found.clear();
         for (view, sight) in self.sights.iter().enumerate() {
-            let level = match &sight.fine {
-                Some(fine) if pass.fine => fine,
-                _ => &sight.coarse,
-            };
+            let level = if pass.fine { &sight.fine } else { &sight.coarse };
             let state =
                 State { pose: &refined.pose, form: refined.form, turn: refined.turns[view] };
             let up = self.query.up;

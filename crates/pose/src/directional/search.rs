@@ -27,10 +27,10 @@ pub struct Sight<'a> {
     pub optical_from_base: Transform,
     /// The lens does not distort.
     pub straight: bool,
-    /// Gradient at the working scale.
+    /// The picture at the working scale.
     pub coarse: Level,
-    /// Gradient at full resolution, when the working scale is coarser.
-    pub fine: Option<Level>,
+    /// The picture at full resolution, hardly smoothed.
+    pub fine: Level,
     /// Directional distances at the working scale.
     pub field: Field,
 }

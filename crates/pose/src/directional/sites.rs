@@ -29,12 +29,12 @@ const CONTACT_SD: f64 = 0.0015;
 /// Most edges kept at a site.
 pub const CANDIDATES: usize = 4;
 /// A slope counts as an edge from this many noise deviations on.
-const NOISE_FACTOR: f32 = 3.5;
+const NOISE_FACTOR: f32 = 2.1;
 
 /// Deviation of a slope's maximum (px of the level) by noise, at a slope of one noise deviation: the
 /// noise of the second derivative against its size at the maximum of a blurred step, whose blur is
 /// the lens's, the pixel's and the level's together.
-const NOISE_TO_PLACE: f64 = 1.9;
+const NOISE_TO_PLACE: f64 = 1.3;
 
 /// Share of a slope's maximum that its neighbours are taken to have at least.
 const LEAST_SHOULDER: f32 = 0.02;
@@ -259,7 +259,7 @@ fn find_edges(site: &mut Site, level: &Level, range_px: f64, profile: &mut Vec<f
     profile.pop();
     let step = crossings.step * scale;
     let first = crossings.first * scale + 0.5 * step;
-    let threshold = NOISE_FACTOR * level.noise;
+    let threshold = NOISE_FACTOR * level.step_noise;
     let mut strongest = 0.0f32;
     for i in 1..profile.len() - 1 {
         let sign = profile[i].signum();
@@ -275,7 +275,7 @@ fn find_edges(site: &mut Site, level: &Level, range_px: f64, profile: &mut Vec<f
         }
         let height = b * (0.25 * (lc - la) * peak).exp();
         strongest = strongest.max(height);
-        let noise_px = NOISE_TO_PLACE * f64::from(level.noise / height) * step;
+        let noise_px = NOISE_TO_PLACE * f64::from(level.step_noise / height) * step;
         let weight = f64::from(height);
         insert(site, Candidate { offset, weight, noise_px, slope: sign * height });
     }
