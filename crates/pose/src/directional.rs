@@ -228,7 +228,7 @@ impl Search<'_> {
     /// Refinement at the working scale, wide and coarse: enough to tell which hypothesis is right.
     fn refine_roughly(&self, start: &Transform, rests: bool) -> (Refined, Explained) {
         let s = self.scale();
-        let passes = [(2.5, 7.0, 5.0), (1.2, 5.0, 5.0)]
+        let passes = [(2.0, 5.0, 5.0), (1.0, 3.0, 5.0)]
             .map(|(sd, range, spacing)| Pass::new(s * sd, s * range, s * spacing, false));
         let mut refined = Refined::new(start, rests, self.sights.len());
         self.refine(&mut refined, &passes);

@@ -33,9 +33,12 @@ const SPREAD: usize = 4;
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Field {
     planes: Vec<Plane>,
+    /// The planes' tables, one after the other: a single piece of memory, which the allocator keeps
+    /// from one recognition to the next instead of giving it back to the system and clearing it anew.
+    tables: Vec<u16>,
 }
 
-/// One direction's table.
+/// One direction.
 #[derive(Debug, Clone, PartialEq)]
 struct Plane {
     /// Rows run along x and columns along y (for lines flatter than 45 degrees).
@@ -44,8 +47,8 @@ struct Plane {
     cols: usize,
     /// Column shift of a line through row 0, at every row.
     shift: Vec<i32>,
-    /// `rows + 1` rows: sum of the values above, along the line.
-    integral: Vec<u16>,
+    /// Where its table begins: `rows + 1` rows, the sum of the values above, along the line.
+    start: usize,
     /// Mean value: what a segment laid down at random would read.
     mean: f32,
 }
@@ -59,14 +62,15 @@ impl Field {
             bins[(e.direction / STEP + 0.5) as usize % DIRECTIONS].push(*e);
         }
         let mut values = Vec::new();
+        let mut tables = Vec::with_capacity(DIRECTIONS * (width + 1) * (height + 1));
         let planes = (0..DIRECTIONS)
             .map(|k| {
                 let near = (k + DIRECTIONS - SPREAD)..=(k + DIRECTIONS + SPREAD);
                 let edgels = near.flat_map(|b| &bins[b % DIRECTIONS]);
-                Plane::new(edgels, k as f32 * STEP, width, height, &mut values)
+                Plane::new(edgels, k as f32 * STEP, width, height, &mut values, &mut tables)
             })
             .collect();
-        Field { planes }
+        Field { planes, tables }
     }
 
     /// Sum over a segment (level pixels) of the mean distance that chance would give minus the
@@ -78,7 +82,8 @@ impl Field {
             return (0.0, 0.0);
         }
         let plane = self.planes.get(nearest_direction(dx, dy));
-        plane.map_or((0.0, 0.0), |p| p.evidence(from, to, (dx * dx + dy * dy).sqrt()))
+        let length = (dx * dx + dy * dy).sqrt();
+        plane.map_or((0.0, 0.0), |p| p.evidence(&self.tables[p.start..], from, to, length))
     }
 
     /// The value (px) of one direction's field at a pixel, for pictures.
@@ -86,8 +91,9 @@ impl Field {
         let plane = &self.planes[direction];
         let (row, col) = if plane.transposed { (x, y) } else { (y, x) };
         let i = row * plane.cols + col;
-        let before = plane.step_back(row, col as i32).map_or(0, |c| plane.integral[i - col + c]);
-        f32::from(plane.integral[i + plane.cols].wrapping_sub(before)) / f32::from(UNIT)
+        let table = &self.tables[plane.start..];
+        let before = plane.step_back(row, col as i32).map_or(0, |c| table[i - col + c]);
+        f32::from(table[i + plane.cols].wrapping_sub(before)) / f32::from(UNIT)
     }
 }
 
@@ -115,6 +121,7 @@ impl Plane {
         width: usize,
         height: usize,
         values: &mut Vec<u16>,
+        tables: &mut Vec<u16>,
     ) -> Self {
         let (sin, cos) = angle.sin_cos();
         let transposed = sin.abs() < cos.abs();
@@ -142,8 +149,8 @@ impl Plane {
         let shift: Vec<i32> = (0..rows).map(|r| (r as f32 * lean).round() as i32).collect();
         let total: u64 = values.iter().map(|&v| u64::from(v)).sum();
         let mean = total as f32 / values.len().max(1) as f32;
-        let mut plane = Plane { transposed, rows, cols, shift, integral: Vec::new(), mean };
-        plane.integrate(values);
+        let plane = Plane { transposed, rows, cols, shift, start: tables.len(), mean };
+        plane.integrate(values, tables);
         plane
     }
 
@@ -153,18 +160,17 @@ impl Plane {
         usize::try_from(col - delta).ok().filter(|&c| c < self.cols && row > 0)
     }
 
-    /// Row `r + 1` of the table holds, at column c, the sum along the line that passes (r, c),
+    /// Appends the plane's table. Its row `r + 1` holds, at column c, the sum along the line that passes (r, c),
     /// down to and including row r.
-    fn integrate(&mut self, values: &[u16]) {
+    fn integrate(&self, values: &[u16], tables: &mut Vec<u16>) {
         let cols = self.cols;
-        self.integral = Vec::with_capacity((self.rows + 1) * cols);
-        self.integral.resize(cols, 0);
+        tables.resize(self.start + cols, 0);
         for (r, row) in values.chunks_exact(cols).enumerate() {
-            self.integral.extend_from_slice(row);
+            tables.extend_from_slice(row);
             if r == 0 {
                 continue;
             }
-            let (done, target) = self.integral.split_at_mut((r + 1) * cols);
+            let (done, target) = tables[self.start..].split_at_mut((r + 1) * cols);
             let above = &done[r * cols..];
             match self.shift[r] - self.shift[r - 1] {
                 1 => add(&mut target[1..], &above[..cols - 1]),
@@ -174,7 +180,7 @@ impl Plane {
         }
     }
 
-    fn evidence(&self, from: (f32, f32), to: (f32, f32), length: f32) -> (f32, f32) {
+    fn evidence(&self, table: &[u16], from: (f32, f32), to: (f32, f32), length: f32) -> (f32, f32) {
         let swap = |p: (f32, f32)| if self.transposed { (p.0, p.1) } else { (p.1, p.0) };
         let ((mut r0, c0), (mut r1, c1)) = (swap(from), swap(to));
         if r0 > r1 {
@@ -194,8 +200,8 @@ impl Plane {
             |r: usize| usize::try_from(line + self.shift[r]).ok().filter(|&c| c < self.cols);
         let (Some(a), Some(b)) = (inside(first), inside(last)) else { return (0.0, 0.0) };
         let before = self.step_back(first, a as i32);
-        let before = before.map_or(0, |c| self.integral[first * self.cols + c]);
-        let sum = self.integral[(last + 1) * self.cols + b].wrapping_sub(before);
+        let before = before.map_or(0, |c| table[first * self.cols + c]);
+        let sum = table[(last + 1) * self.cols + b].wrapping_sub(before);
         let rows = (last - first + 1) as f32;
         let counted = length * (rows / (r1 - r0).max(rows)).min(1.0);
         ((self.mean - f32::from(sum) / rows) * counted / f32::from(UNIT), counted)

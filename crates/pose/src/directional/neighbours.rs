@@ -19,13 +19,16 @@ use super::verdict::Explained;
 /// How far the contour is moved (px of the working scale, which is at most two of the picture's).
 const HOP_PX: f64 = 2.5;
 /// A start that comes this near (px) to a known optimum will end there.
-const CAUGHT_PX: f64 = 0.3;
+const CAUGHT_PX: f64 = 0.4;
 /// How a start is refined; before all passes are done most are caught.
 const PASSES: [Pass; 4] =
-    [Pass::new(1.0, 5.0, 4.0, true), Pass::new(0.6, 4.0, 2.5, true), FINAL, FINAL];
+    [Pass::new(1.0, 4.0, 5.0, true), Pass::new(0.6, 3.0, 4.0, true), FINAL, FINAL];
 /// A direction is left out when it takes more than this (rad or m) to move the contour that far: a
 /// turn about the axis of a solid of revolution.
 const BLIND: f64 = 0.2;
+/// When a higher top is found, by this many nats, its own neighbourhood is searched; so many at most.
+const HIGHER: f64 = 1.0;
+const MOST_TOPS: usize = 3;
 /// Nats of evidence to one of doubt, by which the covariance weighs optima: a line of print runs along
 /// a whole part, so all its sites agree in the wrong place together.
 const DOUBT_NATS: f64 = 6.0;
@@ -41,14 +44,26 @@ impl Search<'_> {
             (d.transpose() * metric * d).x.sqrt()
         };
         let mut optima = vec![best.clone()];
-        for start in self.starts(&best.0, &metric) {
-            let mut trial = Refined { pose: start, ..best.0.clone() };
-            let caught = PASSES.iter().any(|pass| {
-                self.refine(&mut trial, std::slice::from_ref(pass));
-                optima.iter().any(|o| apart(&o.0, &trial) < CAUGHT_PX)
-            });
-            if !caught {
-                optima.push(self.both(trial));
+        let mut spare = Vec::new();
+        for _ in 0..MOST_TOPS {
+            let top = optima[0].clone();
+            for start in self.starts(&top.0, &metric) {
+                let offsets = top.0.offsets.clone();
+                let sites = std::mem::take(&mut spare);
+                let mut trial = Refined { pose: start, offsets, sites, ..top.0.without_sites() };
+                let caught = PASSES.iter().any(|pass| {
+                    self.refine(&mut trial, std::slice::from_ref(pass));
+                    optima.iter().any(|o| apart(&o.0, &trial) < CAUGHT_PX)
+                });
+                if caught {
+                    spare = trial.sites;
+                } else {
+                    optima.push(self.both(trial));
+                }
+            }
+            optima.sort_by(|a, b| b.1.evidence.total_cmp(&a.1.evidence));
+            if optima[0].1.evidence < top.1.evidence + HIGHER {
+                break;
             }
         }
         *best = self.mixture(optima);
@@ -78,9 +93,8 @@ fn contour_metric(refined: &Refined) -> Matrix6<f64> {
 }
 
 impl Search<'_> {
-    /// The mean of some optima by belief, with the second moment about it of all by doubt.
+    /// The mean of some optima, best first, by belief, with the second moment about it of all by doubt.
     fn mixture(&self, mut optima: Vec<(Refined, Explained)>) -> (Refined, Explained) {
-        optima.sort_by(|a, b| b.1.evidence.total_cmp(&a.1.evidence));
         let explained = optima[0].1;
         let behind = |e: &Explained| explained.evidence - e.evidence;
         optima.retain(|o| behind(&o.1) < MOST_BEHIND * DOUBT_NATS);

@@ -86,7 +86,7 @@ pub struct Pass {
 }
 
 /// The last pass: full resolution, tight.
-pub const FINAL: Pass = Pass::new(EDGE_SD_PX, 4.0, 2.0, true);
+pub const FINAL: Pass = Pass::new(EDGE_SD_PX, 4.0, 2.5, true);
 
 impl Pass {
     /// A pass from its numbers: deviation, range to either side, spacing of sites (picture px).
@@ -174,7 +174,7 @@ impl Search<'_> {
             }
         }
         equations.share_errors(&refined.offsets);
-        let mut now = refined.clone_state();
+        let mut now = refined.without_sites();
         now.apply(moved);
         let (a, b) = self.prior(&now);
         equations.shared(&a, &b);
@@ -328,8 +328,8 @@ impl Refined {
         self.turns.iter_mut().zip(&moved.own).for_each(|(turn, step)| *turn += step);
     }
 
-    /// The unknowns without the sites.
-    fn clone_state(&self) -> Self {
+    /// The unknowns alone.
+    pub(super) fn without_sites(&self) -> Self {
         Refined { sites: Vec::new(), offsets: Vec::new(), turns: self.turns.clone(), ..*self }
     }
 }

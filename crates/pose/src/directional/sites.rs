@@ -298,3 +298,69 @@ fn insert(site: &mut Site, candidate: Candidate) {
         *weakest = candidate;
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::directional::level::Region;
+    use vergence_imaging::Image;
+
+    /// The only edge that is found across a contour at this pixel with this normal.
+    fn edge(level: &Level, pixel: (f64, f64), normal: (f64, f64)) -> f64 {
+        let mut site = Site {
+            view: 0,
+            part: 0,
+            along: 0.0,
+            kind: Kind::Silhouette,
+            pixel,
+            limb: false,
+            normal,
+            length: 2.0,
+            px_per_metre: 1000.0,
+            contact: false,
+            by_shared: ByShared::zeros(),
+            by_lip: 0.0,
+            by_turn: RowVector2::zeros(),
+            inner: None,
+            candidates: Default::default(),
+            count: 0,
+        };
+        find_edges(&mut site, level, 4.0, &mut Vec::new());
+        assert_eq!(site.count, 1, "{:?}", site.edges());
+        site.candidates[0].offset
+    }
+
+    /// Step of a lens that blurs by half a pixel, averaged over pixels.
+    fn step(x: f64) -> f64 {
+        let lens = |t: f64| 1.0 / (1.0 + (-t / 0.28).exp());
+        (0..8).map(|k| lens(x - 0.4375 + 0.125 * f64::from(k))).sum::<f64>() / 8.0
+    }
+
+    #[test]
+    fn edges_have_no_bias_wherever_they_lie_between_pixels() {
+        let (width, height) = (48, 48);
+        let whole = Region { left: 0, top: 0, width, height };
+        for (nx, ny) in [(1.0, 0.0), (0.0, -1.0), (0.8, 0.6), (-0.28, 0.96)] {
+            for phase in 0..10 {
+                // The edge passes the picture's middle at this distance along the normal.
+                let shift = 0.1 * f64::from(phase);
+                let grey = |x: usize, y: usize| {
+                    let along = nx * (x as f64 - 24.0) + ny * (y as f64 - 24.0);
+                    (40.0 + 160.0 * step(along - shift)).round() as u8
+                };
+                let mut image = Image::filled(width, height, 0u8);
+                for y in 0..height {
+                    image.row_mut(y).iter_mut().enumerate().for_each(|(x, v)| *v = grey(x, y));
+                }
+                let level = Level::new(&image, &whole, 1, 0.35);
+                // Sites along the contour, as a part has them.
+                let offsets = (-4..=4).map(|k| {
+                    let t = 1.7 * f64::from(k);
+                    edge(&level, (24.0 - t * ny, 24.0 + t * nx), (nx, ny)) - shift
+                });
+                let bias = offsets.sum::<f64>() / 9.0;
+                assert!(bias.abs() < 0.03, "normal ({nx}, {ny}), {shift:.1} px: {bias:.3}");
+            }
+        }
+    }
+}
