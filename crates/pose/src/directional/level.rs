@@ -1,9 +1,10 @@
-//! One scale of one picture: the gradient where the object can be, and its noise.
+//! One scale of one picture: slopes where the object can be, and their noise.
 //!
 //! **In:** a view, the region that the object can reach around its landmark, a scale (a power of
-//! two). **Out:** the Gaussian derivatives of the picture, averaged down by the scale, within the
-//! region, and the standard deviation that sensor noise gives them. Only the region is worked on,
-//! so the time depends on the object's size in pixels, not on the camera's resolution.
+//! two), how much to smooth. **Out:** the picture within the region, averaged down by the scale and
+//! smoothed, its slopes and profiles across contours, and the standard deviation that sensor noise
+//! gives those. Only the region is worked on, so the time depends on the object's size in pixels, not
+//! on the camera's resolution.
 
 use vergence_imaging::{Image, kernel};
 
@@ -45,7 +46,7 @@ pub struct Crossings {
     pub step: f64,
 }
 
-/// The gradient of a region of a picture at one scale.
+/// A region of a picture at one scale.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Level {
     /// Pixels of the picture to one of this level, each way.

@@ -300,21 +300,17 @@ fn insert(site: &mut Site, candidate: Candidate) {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::directional::level::Region;
-    use vergence_imaging::Image;
-
-    /// The only edge that is found across a contour at this pixel with this normal.
-    fn edge(level: &Level, pixel: (f64, f64), normal: (f64, f64)) -> f64 {
-        let mut site = Site {
+impl Site {
+    /// A place on a silhouette, upright in the picture's middle, without edges.
+    pub fn bare() -> Self {
+        Site {
             view: 0,
             part: 0,
             along: 0.0,
             kind: Kind::Silhouette,
-            pixel,
+            pixel: (100.0, 100.0),
             limb: false,
-            normal,
+            normal: (1.0, 0.0),
             length: 2.0,
             px_per_metre: 1000.0,
             contact: false,
@@ -324,7 +320,19 @@ mod tests {
             inner: None,
             candidates: Default::default(),
             count: 0,
-        };
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::directional::level::Region;
+    use vergence_imaging::Image;
+
+    /// The only edge that is found across a contour at this pixel with this normal.
+    fn edge(level: &Level, pixel: (f64, f64), normal: (f64, f64)) -> f64 {
+        let mut site = Site { pixel, normal, ..Site::bare() };
         find_edges(&mut site, level, 4.0, &mut Vec::new());
         assert_eq!(site.count, 1, "{:?}", site.edges());
         site.candidates[0].offset

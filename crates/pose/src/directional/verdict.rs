@@ -147,32 +147,15 @@ fn likelihoods(site: &Site, sd_px: f64, scale: f64) -> [[f64; GRID]; 2] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::directional::sites::{ByShared, Candidate};
-    use nalgebra::RowVector2;
+    use crate::directional::sites::Candidate;
 
     /// Forty sites of one part with an edge each, at these offsets (px) and slopes.
     fn part(edge: impl Fn(usize) -> (f64, f32)) -> Vec<Site> {
         let site = |k: usize| {
             let (offset, slope) = edge(k);
             let found = Candidate { offset, weight: 1.0, noise_px: 0.1, slope };
-            Site {
-                view: 0,
-                part: 0,
-                along: 0.002 * k as f64,
-                kind: Kind::Silhouette,
-                pixel: (100.0, 100.0),
-                limb: false,
-                normal: (1.0, 0.0),
-                length: 2.0,
-                px_per_metre: 1000.0,
-                contact: false,
-                by_shared: ByShared::zeros(),
-                by_lip: 0.0,
-                by_turn: RowVector2::zeros(),
-                inner: None,
-                candidates: [found, Candidate::default(), found, found],
-                count: 1,
-            }
+            let candidates = [found, Candidate::default(), found, found];
+            Site { along: 0.002 * k as f64, candidates, count: 1, ..Site::bare() }
         };
         (0..40).map(site).collect()
     }
