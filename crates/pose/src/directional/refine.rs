@@ -17,7 +17,7 @@ use vergence_geometry::gaussian::{perturb, skew};
 
 use super::equations::{Equations, Move, Offsets};
 use super::search::Search;
-use super::sites::{Form, Layout, SHARED, Site, State, sites};
+use super::sites::{FORM_AT, Form, Layout, SHARED, Site, State, sites};
 use crate::model::Kind;
 
 /// Standard deviation of an edge's place once the pose is right (px): aliasing, gamma, blooming and
@@ -202,7 +202,7 @@ impl Search<'_> {
         let mut j = SMatrix::<f64, 3, SHARED>::zeros();
         j.fixed_view_mut::<3, 3>(0, 0).copy_from(&-skew(&lever));
         j.fixed_view_mut::<3, 3>(0, 3).copy_from(&Matrix3::identity());
-        j.fixed_view_mut::<3, 1>(0, 6).copy_from(&lever);
+        j.fixed_view_mut::<3, 1>(0, FORM_AT).copy_from(&lever);
         (self.query.landmark.position.coords - centre - lever, j)
     }
 
@@ -233,7 +233,7 @@ impl Search<'_> {
         let mut by_shared = SMatrix::<f64, 2, SHARED>::zeros();
         by_shared.fixed_view_mut::<2, 3>(0, 0).copy_from(&(by_base * -skew(&lever)));
         by_shared.fixed_view_mut::<2, 3>(0, 3).copy_from(&by_base);
-        by_shared.fixed_view_mut::<2, 1>(0, 6).copy_from(&(by_base * lever));
+        by_shared.fixed_view_mut::<2, 1>(0, FORM_AT).copy_from(&(by_base * lever));
         let by_turn = by_point * -skew(&p.coords);
         Some((seen - pixel, by_shared, by_turn.fixed_columns::<2>(0).into_owned()))
     }
@@ -244,7 +244,7 @@ impl Search<'_> {
         (self.query.landmark.covariance + place).try_inverse().unwrap_or_default()
     }
 
-    /// Information and right-hand side of the landmark, of gravity and of the size.
+    /// Information and right-hand side of the landmark, of gravity and of the form.
     fn prior(&self, state: &Refined) -> (SharedMatrix, SharedVector) {
         let (residual, j) = self.landmark_residual(state);
         let weight = self.landmark_weight();
@@ -259,8 +259,8 @@ impl Search<'_> {
             rhs += tilts * turn;
         }
         for (k, (sd, off)) in form_sd().iter().zip(&(state.form - usual())).enumerate() {
-            a[(6 + k, 6 + k)] += sd.powi(-2);
-            b[6 + k] -= off * sd.powi(-2);
+            a[(FORM_AT + k, FORM_AT + k)] += sd.powi(-2);
+            b[FORM_AT + k] -= off * sd.powi(-2);
         }
         // A solid of revolution says nothing about one turn: hold it.
         a += SharedMatrix::identity() * 1e-3;
@@ -324,7 +324,7 @@ impl Refined {
 
     fn apply(&mut self, moved: &Move) {
         self.pose = perturb(&self.pose, &moved.shared.fixed_rows::<6>(0).into_owned());
-        self.form += moved.shared.fixed_rows::<3>(6);
+        self.form += moved.shared.fixed_rows::<3>(FORM_AT);
         self.turns.iter_mut().zip(&moved.own).for_each(|(turn, step)| *turn += step);
     }
 

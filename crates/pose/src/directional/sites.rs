@@ -53,7 +53,9 @@ pub struct Candidate {
 }
 
 /// Unknowns that all views share: the pose's tangent (rad, m), then the [`Form`].
-pub const SHARED: usize = 9;
+pub const SHARED: usize = FORM_AT + 3;
+/// Where the form begins among them.
+pub const FORM_AT: usize = 6;
 
 /// How a site's contour moves across itself by the shared unknowns.
 pub type ByShared = RowSVector<f64, SHARED>;
@@ -210,8 +212,8 @@ pub fn sites(
             let mut by_shared = ByShared::zeros();
             by_shared.fixed_columns_mut::<3>(0).copy_from(&by_rotation);
             by_shared.fixed_columns_mut::<3>(3).copy_from(&by_base);
-            by_shared[6] = (by_base * lever).x;
-            by_shared[7] = if swells { 1.0 } else { 0.0 };
+            by_shared[FORM_AT] = (by_base * lever).x;
+            by_shared[FORM_AT + 1] = if swells { 1.0 } else { 0.0 };
             let towards_axis = -Vector3::new(in_object.x, in_object.y, 0.0);
             let by_lip = match (segment.kind, towards_axis.try_normalize(1e-9)) {
                 (Kind::Rim, Some(inwards)) => (by_base * (pose.rotation * inwards)).x,
@@ -280,7 +282,7 @@ fn find_edges(site: &mut Site, level: &Level, range_px: f64, profile: &mut Vec<f
         insert(site, Candidate { offset, weight, noise_px, slope: sign * height });
     }
     for candidate in &mut site.candidates[..site.count] {
-        candidate.weight = 0.3 + (1.0 - 0.3) * candidate.weight / f64::from(strongest);
+        candidate.weight = 0.3 + 0.7 * candidate.weight / f64::from(strongest);
     }
 }
 
@@ -327,7 +329,7 @@ impl Site {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::directional::level::Region;
+    use crate::directional::level::{Reduced, Region};
     use vergence_imaging::Image;
 
     /// The only edge that is found across a contour at this pixel with this normal.
@@ -360,7 +362,7 @@ mod tests {
                 for y in 0..height {
                     image.row_mut(y).iter_mut().enumerate().for_each(|(x, v)| *v = grey(x, y));
                 }
-                let level = Level::new(&image, &whole, 1, 0.35);
+                let level = Reduced::new(&image, &whole, 1).smoothed(0.35);
                 // Sites along the contour, as a part has them.
                 let offsets = (-4..=4).map(|k| {
                     let t = 1.7 * f64::from(k);
