@@ -253,8 +253,7 @@ impl Search<'_> {
             s /= 2.0;
             passes.push(Pass::new(s, 4.0 * s, 2.5 * s, true));
         }
-        passes.push(Pass::new(0.6, 4.0, 2.5, true));
-        passes.extend([FINAL, FINAL]);
+        passes.extend([Pass::new(0.6, 4.0, 2.5, true), FINAL]);
         self.refine(&mut refined, &passes);
         self.both(refined)
     }

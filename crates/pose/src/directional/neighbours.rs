@@ -12,7 +12,7 @@ use nalgebra::{Matrix6, Vector6};
 use vergence_geometry::Transform;
 use vergence_geometry::gaussian::{difference, perturb};
 
-use super::refine::{FINAL, Pass, Refined};
+use super::refine::{EDGE_SD_PX, FINAL, Pass, Refined};
 use super::search::Search;
 use super::verdict::Explained;
 
@@ -23,6 +23,9 @@ const CAUGHT_PX: f64 = 0.4;
 /// How a start is refined; before all passes are done most are caught.
 const PASSES: [Pass; 4] =
     [Pass::new(1.0, 4.0, 5.0, true), Pass::new(0.6, 3.0, 4.0, true), FINAL, FINAL];
+/// What the tops that count are refined by at last: a site at every pixel. Where sites happen to fall
+/// on print and noise no longer matters, and the long passes before it can do with fewer.
+const POLISH: Pass = Pass::new(EDGE_SD_PX, 4.0, 1.0, true);
 /// A direction is left out when it takes more than this (rad or m) to move the contour that far: a
 /// turn about the axis of a solid of revolution.
 const BLIND: f64 = 0.2;
@@ -98,6 +101,7 @@ impl Search<'_> {
         let explained = optima[0].1;
         let behind = |e: &Explained| explained.evidence - e.evidence;
         optima.retain(|o| behind(&o.1) < MOST_BEHIND * DOUBT_NATS);
+        optima.iter_mut().for_each(|o| self.refine(&mut o.0, &[POLISH]));
         let place = optima[0].0.pose;
         let (mut mean, mut beliefs) = (Vector6::zeros(), 0.0);
         for (refined, explained) in &mut optima {
