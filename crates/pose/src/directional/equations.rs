@@ -19,7 +19,7 @@
 use multiversion::multiversion;
 use nalgebra::{Matrix4, Matrix6, SMatrix, SVector, Vector2, Vector4};
 
-use super::sites::{ByShared, SHARED, Site};
+use super::sites::{LIP_AT, SHARED, Site};
 
 /// Unknowns of each view: small turns of its camera.
 const OWN: usize = 2;
@@ -56,18 +56,39 @@ pub(super) struct Move {
 }
 
 /// One measurement of a site.
-struct Edge {
-    /// Part and kind, piece, view.
-    key: (u32, u32, usize),
-    by_shared: SVector<f64, SHARED>,
-    by_own: Vector2<f64>,
+pub(super) struct Edge<'a> {
+    /// The site.
+    pub site: &'a Site,
+    /// It is the inner edge of the lip.
+    pub inner: bool,
     /// Against a site with one edge of good contrast.
-    weight: f64,
-    residual: f64,
-    /// Pixels to a metre.
-    scale: f64,
-    /// Deviation of the part's offset (m).
-    offset_sd: f64,
+    pub weight: f64,
+    /// How far off it is (px).
+    pub residual: f64,
+}
+
+impl Edge<'_> {
+    fn piece(&self) -> u32 {
+        (self.site.along / PIECE) as u32
+    }
+}
+
+/// Sites in the order in which they share errors: by [`part_of`], piece and view.
+pub(super) fn by_part(sites: &[Site]) -> Vec<&Site> {
+    let mut sorted: Vec<(u64, &Site)> = sites.iter().map(|s| (order(s), s)).collect();
+    // Stable: sites come along the contour of one view after the other.
+    sorted.sort_by_key(|s| s.0);
+    sorted.into_iter().map(|s| s.1).collect()
+}
+
+fn order(site: &Site) -> u64 {
+    let piece = (site.along / PIECE) as u32;
+    u64::from(part_of(site)) << 40 | u64::from(piece) << 8 | site.view as u64
+}
+
+/// Part and kind: what errs together.
+pub(super) fn part_of(site: &Site) -> u32 {
+    3 * u32::from(site.part) + site.kind as u32
 }
 
 /// A part's own unknowns once those of the others are: offset (m), tilt (m at its ends), offset in
@@ -86,7 +107,6 @@ pub(super) struct Equations {
     doubt: f64,
     a: SMatrix<f64, ALL, ALL>,
     b: SVector<f64, ALL>,
-    edges: Vec<Edge>,
     parts: Vec<Eliminated>,
 }
 
@@ -100,79 +120,20 @@ impl Equations {
             a[(k, k)] = 1.0;
         }
         let b = SVector::zeros();
-        Equations { views, sd_px, doubt, a, b, edges: Vec::new(), parts: Vec::new() }
+        Equations { views, sd_px, doubt, a, b, parts: Vec::new() }
     }
 
-    /// Adds the measurement of a site.
-    pub fn edge(&mut self, site: &Site, by_shared: &ByShared, weight: f64, residual: f64) {
-        let part = 3 * u32::from(site.part) + site.kind as u32;
-        self.edges.push(Edge {
-            key: (part, (site.along / PIECE) as u32, site.view),
-            by_shared: by_shared.transpose(),
-            by_own: site.by_turn.transpose(),
-            weight,
-            residual,
-            scale: site.px_per_metre,
-            offset_sd: site.offset_sd(),
-        });
-    }
-
-    /// Turns the sites into equations, without what only the parts' own offsets explain; to be
-    /// called once all sites are in. `offsets` are the parts' offsets as last seen.
-    pub fn share_errors(&mut self, offsets: &[Offsets]) {
-        let edges = std::mem::take(&mut self.edges);
-        let mut sorted: Vec<&Edge> = edges.iter().collect();
-        sorted.sort_by_key(|e| e.key);
-        for part in sorted.chunk_by(|a, b| a.key.0 == b.key.0) {
-            let known = offsets.iter().find(|o| o.part == part[0].key.0);
-            self.part(part, known.copied().unwrap_or_default());
-        }
-    }
-
-    fn part(&mut self, edges: &[&Edge], seen: Offsets) {
-        let scatter: [f64; VIEWS] = std::array::from_fn(|v| self.scatter(edges, v));
-        let (first, last) = (edges[0].key.1, edges[edges.len() - 1].key.1);
-        let mut a = SMatrix::<f64, WITH_PART, WITH_PART>::zeros();
-        let mut b = SVector::<f64, WITH_PART>::zeros();
-        let mut of_site = b;
-        let mut of_piece = b;
-        for piece in edges.chunk_by(|a, b| a.key.1 == b.key.1) {
-            // From -1 to 1 along the part.
-            let place = f64::from(2 * (piece[0].key.1 - first)) / f64::from((last - first).max(1));
-            let place = if last > first { place - 1.0 } else { 0.0 };
-            of_piece.fill(0.0);
-            let (mut information, mut moment) = (0.0, 0.0);
-            for view in piece.chunk_by(|a, b| a.key.2 == b.key.2) {
-                let v = view[0].key.2;
-                let at = SHARED + OWN * v;
-                let weight: f64 = view.iter().map(|e| e.weight).sum();
-                of_site.fill(0.0);
-                let mut residual = 0.0;
-                for e in view {
-                    let w = e.weight / weight;
-                    of_site.fixed_rows_mut::<SHARED>(0).axpy(w, &e.by_shared, 1.0);
-                    of_site.fixed_rows_mut::<OWN>(at).axpy(w, &e.by_own, 1.0);
-                    residual += w * e.residual;
-                }
-                let scale = view[0].scale;
-                of_site[ALL] = scale;
-                of_site[ALL + 1] = scale * place;
-                of_site[ALL + 2 + v] = 1.0;
-                let weight = weight / scatter[v];
-                add_outer(&mut a, weight, &of_site);
-                b.axpy(weight * residual, &of_site, 1.0);
-                of_piece.axpy(weight * scale, &of_site, 1.0);
-                information += weight * scale * scale;
-                moment += weight * scale * residual;
-            }
-            let share = 1.0 / (information + (self.doubt * PIECE_SD).powi(-2));
-            add_outer(&mut a, -share, &of_piece);
-            b.axpy(-share * moment, &of_piece, 1.0);
-        }
+    /// Adds the measurements of one part, by piece and view, without what only the part's own offsets
+    /// explain. `offsets` are the parts' offsets as last seen.
+    pub fn part(&mut self, edges: &[Edge], offsets: &[Offsets]) {
+        let Some(part) = edges.first().map(|e| part_of(e.site)) else { return };
+        let seen = offsets.iter().find(|o| o.part == part).copied().unwrap_or_default();
+        let scatter = scatter(edges, self.sd_px);
+        let (a, b) = normal_equations(edges, &scatter, (self.doubt * PIECE_SD).powi(-2));
         // Heavy tails: a part that was seen to be off by much may well be off by much.
         let tailed =
             |variance: f64, seen: f64, tail: f64| (tail * variance + seen * seen) / (tail + 1.0);
-        let variance = tailed(edges[0].offset_sd.powi(2), seen.shared, OFFSET_TAIL);
+        let variance = tailed(edges[0].site.offset_sd().powi(2), seen.shared, OFFSET_TAIL);
         let doubt = self.doubt * self.doubt;
         let mut inner = a.fixed_view::<PART, PART>(ALL, ALL).into_owned();
         inner[(0, 0)] += (doubt * variance).recip();
@@ -188,19 +149,7 @@ impl Equations {
         let lost = mixed * inverse;
         self.a += a.fixed_view::<ALL, ALL>(0, 0) - lost * mixed.transpose();
         self.b += b.fixed_rows::<ALL>(0) - lost * rhs;
-        self.parts.push(Eliminated { part: edges[0].key.0, inverse, mixed, rhs });
-    }
-
-    /// Variance of a part's edges in a view about their mean (px^2).
-    fn scatter(&self, edges: &[&Edge], view: usize) -> f64 {
-        let edges = || edges.iter().filter(|e| e.key.2 == view);
-        let weight: f64 = edges().map(|e| e.weight).sum();
-        if weight <= 0.0 {
-            return self.sd_px.powi(2);
-        }
-        let mean = edges().map(|e| e.weight * e.residual).sum::<f64>() / weight;
-        let squares: f64 = edges().map(|e| e.weight * (e.residual - mean).powi(2)).sum();
-        (SCATTER_PRIOR * self.sd_px.powi(2) + squares) / (SCATTER_PRIOR + weight)
+        self.parts.push(Eliminated { part, inverse, mixed, rhs });
     }
 
     fn add(
@@ -268,17 +217,85 @@ impl Equations {
     }
 }
 
-/// Adds `weight v v'`.
-#[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
-fn add_outer(a: &mut SMatrix<f64, WITH_PART, WITH_PART>, weight: f64, v: &SVector<f64, WITH_PART>) {
-    let v = v.as_slice();
-    for (column, &of_column) in a.as_mut_slice().chunks_exact_mut(WITH_PART).zip(v) {
-        // What the other view has of its own is zero.
-        if of_column != 0.0 {
-            let w = weight * of_column;
-            column.iter_mut().zip(v).for_each(|(c, v)| *c += w * v);
-        }
+/// Variance of a part's edges in each view about their mean (px^2).
+fn scatter(edges: &[Edge], sd_px: f64) -> [f64; VIEWS] {
+    // Weight, weighted residual and square.
+    let mut sums = [[0.0; 3]; VIEWS];
+    for e in edges {
+        let sum = &mut sums[e.site.view];
+        sum[0] += e.weight;
+        sum[1] += e.weight * e.residual;
+        sum[2] += e.weight * e.residual * e.residual;
     }
+    let usual = sd_px * sd_px;
+    sums.map(|[weight, moment, square]| {
+        let about_mean = (square - moment * moment / weight.max(f64::MIN_POSITIVE)).max(0.0);
+        (SCATTER_PRIOR * usual + about_mean) / (SCATTER_PRIOR + weight)
+    })
+}
+
+/// Normal equations of a part's edges for all unknowns and the part's own, the pieces' offsets
+/// (of that precision, 1/m^2) eliminated.
+#[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
+fn normal_equations(
+    edges: &[Edge],
+    scatter: &[f64; VIEWS],
+    precision: f64,
+) -> (SMatrix<f64, WITH_PART, WITH_PART>, SVector<f64, WITH_PART>) {
+    let mut a = [[0.0; WITH_PART]; WITH_PART];
+    let mut b = [0.0; WITH_PART];
+    let add = |to: &mut [f64; WITH_PART], scale: f64, v: &[f64; WITH_PART]| {
+        to.iter_mut().zip(v).for_each(|(t, v)| *t += scale * v);
+    };
+    let (first, last) = (edges[0].piece(), edges[edges.len() - 1].piece());
+    for piece in edges.chunk_by(|a, b| a.piece() == b.piece()) {
+        // From -1 to 1 along the part.
+        let place = f64::from(2 * (piece[0].piece() - first)) / f64::from((last - first).max(1));
+        let place = if last > first { place - 1.0 } else { 0.0 };
+        let mut of_piece = [0.0; WITH_PART];
+        let (mut information, mut moment) = (0.0, 0.0);
+        for view in piece.chunk_by(|a, b| a.site.view == b.site.view) {
+            // The mean edge of the piece in this view.
+            let v = view[0].site.view;
+            let mut of_site = [0.0; WITH_PART];
+            let (mut weight, mut residual, mut turn) = (0.0, 0.0, [0.0; OWN]);
+            for e in view {
+                let by_shared = e.site.by_shared.iter();
+                of_site.iter_mut().zip(by_shared).for_each(|(o, j)| *o += e.weight * j);
+                if e.inner {
+                    of_site[LIP_AT] += e.weight * e.site.by_lip;
+                }
+                turn.iter_mut().zip(e.site.by_turn.iter()).for_each(|(o, j)| *o += e.weight * j);
+                weight += e.weight;
+                residual += e.weight * e.residual;
+            }
+            let each = weight.recip();
+            residual *= each;
+            of_site[SHARED + OWN * v..][..OWN].copy_from_slice(&turn);
+            of_site.iter_mut().for_each(|o| *o *= each);
+            let scale = view[0].site.px_per_metre;
+            of_site[ALL] = scale;
+            of_site[ALL + 1] = scale * place;
+            of_site[ALL + 2 + v] = 1.0;
+            let weight = weight / scatter[v];
+            for (column, &of_column) in a.iter_mut().zip(&of_site) {
+                // What the other view has of its own is zero.
+                if of_column != 0.0 {
+                    add(column, weight * of_column, &of_site);
+                }
+            }
+            add(&mut b, weight * residual, &of_site);
+            add(&mut of_piece, weight * scale, &of_site);
+            information += weight * scale * scale;
+            moment += weight * scale * residual;
+        }
+        let share = 1.0 / (information + precision);
+        for (column, &of_column) in a.iter_mut().zip(&of_piece) {
+            add(column, -share * of_column, &of_piece);
+        }
+        add(&mut b, -share * moment, &of_piece);
+    }
+    (a.into(), b.into())
 }
 
 /// How far off the edges of a part are.

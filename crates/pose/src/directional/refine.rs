@@ -15,9 +15,9 @@ use nalgebra::{Matrix2, Matrix3, Matrix6, Point3, SMatrix, SVector, Vector2, Vec
 use vergence_geometry::Transform;
 use vergence_geometry::gaussian::{perturb, skew};
 
-use super::equations::{Equations, Move, Offsets};
+use super::equations::{Edge, Equations, Move, Offsets, by_part, part_of};
 use super::search::Search;
-use super::sites::{FORM_AT, Form, Layout, SHARED, Site, State, sites};
+use super::sites::{FORM_AT, Form, LIP_AT, Layout, SHARED, Site, State, sites};
 use crate::model::Kind;
 
 /// Standard deviation of an edge's place once the pose is right (px): aliasing, gamma, blooming and
@@ -53,8 +53,6 @@ const LANDMARK_SD_PX: f64 = 0.3;
 /// Thickness of the lip of an open rim (m), and its deviation.
 const LIP: f64 = 0.003;
 const LIP_SD: f64 = 0.0015;
-/// Where the lip is among the shared unknowns.
-const LIP_AT: usize = SHARED - 1;
 /// Deviation of the swelling of silhouettes (px).
 const SWELL_SD_PX: f64 = 0.4;
 /// Deviation of the logarithm of the object's size: one percent.
@@ -126,14 +124,17 @@ impl Search<'_> {
         let views = self.sights.len();
         for pass in passes {
             self.lay_out(refined, pass);
+            let sites = std::mem::take(&mut refined.sites);
+            let parts = by_part(&sites);
             // Three steps on the same sites: the assignments settle while the geometry is linear.
             let mut moved =
                 Move { shared: SharedVector::zeros(), own: vec![Vector2::zeros(); views] };
             for _ in 0..3 {
-                let Some(step) = self.step(refined, pass, &moved, 1.0) else { break };
+                let Some(step) = self.step(refined, &parts, pass, &moved, 1.0) else { break };
                 moved.shared += step.shared;
                 moved.own.iter_mut().zip(step.own).for_each(|(m, s)| *m += s);
             }
+            refined.sites = sites;
             refined.apply(&moved);
         }
         refined.strain = self.strain(refined);
@@ -142,9 +143,11 @@ impl Search<'_> {
     /// The covariance of a refined pose, with all that sites have in common taken seriously.
     pub fn doubt(&self, refined: &mut Refined, pass: &Pass) {
         self.lay_out(refined, pass);
+        let sites = std::mem::take(&mut refined.sites);
         let views = self.sights.len();
         let still = Move { shared: SharedVector::zeros(), own: vec![Vector2::zeros(); views] };
-        self.step(refined, pass, &still, DOUBT);
+        self.step(refined, &by_part(&sites), pass, &still, DOUBT);
+        refined.sites = sites;
     }
 
     /// Looks for the edges around a refined pose anew.
@@ -161,19 +164,34 @@ impl Search<'_> {
         refined.sites = found;
     }
 
-    /// One Gauss-Newton step from `moved`; keeps the covariance in `refined`.
-    fn step(&self, refined: &mut Refined, pass: &Pass, moved: &Move, doubt: f64) -> Option<Move> {
+    /// One Gauss-Newton step from `moved` on sites in the order of [`by_part`]; keeps the covariance
+    /// in `refined`.
+    fn step(
+        &self,
+        refined: &mut Refined,
+        sites: &[&Site],
+        pass: &Pass,
+        moved: &Move,
+        doubt: f64,
+    ) -> Option<Move> {
         let mut equations = Equations::new(self.sights.len(), pass.sd_px, doubt);
-        for site in &refined.sites {
-            let shift = (site.by_shared * moved.shared).x + (site.by_turn * moved.own[site.view]).x;
-            let lip_shift = site.by_lip * moved.shared[LIP_AT];
-            for (inner, weight, residual) in assign(site, shift, lip_shift, pass.sd_px) {
-                let mut by_shared = site.by_shared;
-                by_shared[LIP_AT] = if inner { site.by_lip } else { 0.0 };
-                equations.edge(site, &by_shared, weight, residual);
+        let mut edges = Vec::new();
+        for part in sites.chunk_by(|a, b| part_of(a) == part_of(b)) {
+            edges.clear();
+            for site in part {
+                let turn = site.by_turn * moved.own[site.view];
+                let shift = (site.by_shared * moved.shared).x + turn.x;
+                let lip_shift = site.by_lip * moved.shared[LIP_AT];
+                let found = assign(site, shift, lip_shift, pass.sd_px);
+                edges.extend(found.map(|(inner, weight, residual)| Edge {
+                    site,
+                    inner,
+                    weight,
+                    residual,
+                }));
             }
+            equations.part(&edges, &refined.offsets);
         }
-        equations.share_errors(&refined.offsets);
         let mut now = refined.without_sites();
         now.apply(moved);
         let (a, b) = self.prior(&now);
@@ -343,6 +361,9 @@ fn form_sd() -> Form {
     Form::new(SIZE_SD, SWELL_SD_PX, LIP_SD)
 }
 
+/// Edges further off than this many deviations have no say.
+const FAR: f64 = 8.0;
+
 /// Measurements of a site whose contour has moved by `shift`, the inner edge of its lip by another
 /// `lip_shift`: for either edge whether it is the inner one, weight (1/px^2) and mean residual (px).
 fn assign(
@@ -364,6 +385,9 @@ fn assign(
             let r = c.offset - place - shift;
             let local = sd * sd + c.noise_px * c.noise_px;
             let total = local + common * common;
+            if r * r > FAR * FAR * total {
+                continue;
+            }
             let likelihood = density * c.weight * (-0.5 * r * r / total).exp() / total.sqrt();
             let weight = likelihood * sd * sd / local;
             sum[0] += likelihood;

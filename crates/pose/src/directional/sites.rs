@@ -56,6 +56,8 @@ pub struct Candidate {
 pub const SHARED: usize = FORM_AT + 3;
 /// Where the form begins among them.
 pub const FORM_AT: usize = 6;
+/// Where the lip is among them.
+pub const LIP_AT: usize = SHARED - 1;
 
 /// How a site's contour moves across itself by the shared unknowns.
 pub type ByShared = RowSVector<f64, SHARED>;
