@@ -29,6 +29,9 @@ pub(super) const VIEWS: usize = 2;
 const ALL: usize = SHARED + OWN * VIEWS;
 const PART: usize = 2 + VIEWS;
 const WITH_PART: usize = ALL + PART;
+/// The same in whole vectors of so many lanes.
+const LANES: usize = 4;
+const PADDED: usize = WITH_PART.next_multiple_of(LANES);
 
 /// Length of a piece (m), and the deviation of its offset from its part's (m): dents, print.
 const PIECE: f64 = 0.015;
@@ -242,22 +245,19 @@ fn normal_equations(
     scatter: &[f64; VIEWS],
     precision: f64,
 ) -> (SMatrix<f64, WITH_PART, WITH_PART>, SVector<f64, WITH_PART>) {
-    let mut a = [[0.0; WITH_PART]; WITH_PART];
-    let mut b = [0.0; WITH_PART];
-    let add = |to: &mut [f64; WITH_PART], scale: f64, v: &[f64; WITH_PART]| {
-        to.iter_mut().zip(v).for_each(|(t, v)| *t += scale * v);
-    };
+    let mut a = [[0.0; PADDED]; PADDED];
+    let mut b = [0.0; PADDED];
     let (first, last) = (edges[0].piece(), edges[edges.len() - 1].piece());
     for piece in edges.chunk_by(|a, b| a.piece() == b.piece()) {
         // From -1 to 1 along the part.
         let place = f64::from(2 * (piece[0].piece() - first)) / f64::from((last - first).max(1));
         let place = if last > first { place - 1.0 } else { 0.0 };
-        let mut of_piece = [0.0; WITH_PART];
+        let mut of_piece = [0.0; PADDED];
         let (mut information, mut moment) = (0.0, 0.0);
         for view in piece.chunk_by(|a, b| a.site.view == b.site.view) {
             // The mean edge of the piece in this view.
             let v = view[0].site.view;
-            let mut of_site = [0.0; WITH_PART];
+            let mut of_site = [0.0; PADDED];
             let (mut weight, mut residual, mut turn) = (0.0, 0.0, [0.0; OWN]);
             for e in view {
                 let by_shared = e.site.by_shared.iter();
@@ -278,24 +278,51 @@ fn normal_equations(
             of_site[ALL + 1] = scale * place;
             of_site[ALL + 2 + v] = 1.0;
             let weight = weight / scatter[v];
-            for (column, &of_column) in a.iter_mut().zip(&of_site) {
-                // What the other view has of its own is zero.
-                if of_column != 0.0 {
-                    add(column, weight * of_column, &of_site);
-                }
-            }
+            add_outer(&mut a, weight, &of_site);
             add(&mut b, weight * residual, &of_site);
             add(&mut of_piece, weight * scale, &of_site);
             information += weight * scale * scale;
             moment += weight * scale * residual;
         }
         let share = 1.0 / (information + precision);
-        for (column, &of_column) in a.iter_mut().zip(&of_piece) {
-            add(column, -share * of_column, &of_piece);
-        }
+        add_outer(&mut a, -share, &of_piece);
         add(&mut b, -share * moment, &of_piece);
     }
-    (a.into(), b.into())
+    let mut whole = SMatrix::<f64, WITH_PART, WITH_PART>::zeros();
+    for (i, column) in whole.as_mut_slice().chunks_exact_mut(WITH_PART).enumerate() {
+        column.copy_from_slice(&a[i][..WITH_PART]);
+        let above = &a[..i / LANES * LANES];
+        column.iter_mut().zip(above).for_each(|(c, row)| *c = row[i]);
+    }
+    (whole, SVector::from_column_slice(&b[..WITH_PART]))
+}
+
+/// Adds `scale v`.
+#[inline(always)]
+fn add(to: &mut [f64; PADDED], scale: f64, v: &[f64; PADDED]) {
+    to.iter_mut().zip(v).for_each(|(t, v)| *t += scale * v);
+}
+
+/// Adds `weight v v'`, from the diagonal's lanes on: the rest is the same.
+#[inline(always)]
+fn add_outer(a: &mut [[f64; PADDED]; PADDED], weight: f64, v: &[f64; PADDED]) {
+    add_rows::<0>(a, weight, v);
+    add_rows::<1>(a, weight, v);
+    add_rows::<2>(a, weight, v);
+    add_rows::<3>(a, weight, v);
+    add_rows::<4>(a, weight, v);
+}
+
+/// [`add_outer`] of the rows of one vector: loops of fixed length become a few vector operations.
+#[inline(always)]
+fn add_rows<const AT: usize>(a: &mut [[f64; PADDED]; PADDED], weight: f64, v: &[f64; PADDED]) {
+    let from = AT * LANES;
+    for i in from..from + LANES {
+        let w = weight * v[i];
+        for j in from..PADDED {
+            a[i][j] += w * v[j];
+        }
+    }
 }
 
 /// How far off the edges of a part are.

@@ -11,6 +11,9 @@ use vergence_imaging::{Image, kernel};
 /// A gradient's noise is never taken to be lower (grey levels per pixel): quantisation.
 const NOISE_FLOOR: f32 = 0.12;
 
+/// Parts of a pixel in fixed point.
+const FIXED: f64 = (1 << 24) as f64;
+
 /// A rectangle of pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Region {
@@ -133,23 +136,26 @@ impl Level {
         let half = (reach * along.abs()).ceil() + 2.0;
         let first = main.round() - sense * half;
         let data = self.smooth.data();
-        let (mut at, mut place) = (first as i32, (cross + lean * (first - main)) as f32);
-        let (forward, slant) = (sense as i32, (sense * lean) as f32);
-        let (last, cross_last) = (size as i32 - 1, cross_size as f32 - 2.0);
+        // The place between rows in parts of 2^24: whole and share without rounding or saturation.
+        let fixed = |v: f64| (v * FIXED) as i64;
+        let (start, slant) = (fixed(cross + lean * (first - main)), fixed(sense * lean));
+        let (forward, last, count) = (sense as i64, size as i64 - 1, 2 * half as i64 + 1);
+        let (least, most) = (fixed(1.0), fixed(cross_size as f64 - 2.0));
+        let at = |k: i64| (first as i64 + forward * k, start + slant * k);
+        let inside =
+            |(at, place): (i64, i64)| at >= 1 && at < last && place >= least && place < most;
+        let value = |(at, place): (i64, i64)| {
+            let share = (place & (FIXED as i64 - 1)) as f32 * (1.0 / FIXED as f32);
+            let i = at as usize * stride + (place >> 24) as usize * cross_stride;
+            let (a, b) = (data[i], data[i + cross_stride]);
+            a + share * (b - a)
+        };
         out.clear();
-        for _ in 0..=2 * half as usize {
-            let inside = at >= 1 && at < last && place >= 1.0 && place < cross_last;
-            out.push(if inside {
-                let whole = place as usize;
-                let share = place - whole as f32;
-                let i = at as usize * stride + whole * cross_stride;
-                let (a, b) = (data[i], data[i + cross_stride]);
-                a + share * (b - a)
-            } else {
-                f32::NAN
-            });
-            at += forward;
-            place += slant;
+        if inside(at(0)) && inside(at(count - 1)) {
+            out.extend((0..count).map(|k| value(at(k))));
+        } else {
+            let within = |k| Some(at(k)).filter(|p| inside(*p)).map_or(f32::NAN, value);
+            out.extend((0..count).map(within));
         }
         Crossings { first: (first - main) / along, step: along.abs().recip() }
     }
