@@ -26,6 +26,8 @@ pub const CAP_PX: f32 = 6.0;
 const ANGLE_PRICE: f32 = 9.5;
 /// Angle between neighbouring directions (rad).
 const STEP: f32 = PI / DIRECTIONS as f32;
+/// The price of a step (units).
+const STEP_PRICE: f32 = ANGLE_PRICE * STEP * UNIT as f32;
 /// Edge points of directions up to this many steps away count for a line.
 const SPREAD: usize = 4;
 
@@ -53,22 +55,33 @@ struct Plane {
     mean: f32,
 }
 
+/// An edge point as the planes read it.
+#[derive(Clone, Copy)]
+struct Point {
+    /// Its place in an upright plane and in a transposed one.
+    at: [u32; 2],
+    /// Price of its turn against the direction in whose bin it is, signed (units).
+    lean: i32,
+}
+
 impl Field {
     /// Builds the tables for a level of this size.
     pub fn new(edgels: &[Edgel], width: usize, height: usize) -> Self {
         // Edge points by direction, so that each plane reads only those that can matter to it.
-        let mut bins: [Vec<Edgel>; DIRECTIONS] = std::array::from_fn(|_| Vec::new());
+        let mut bins: [Vec<Point>; DIRECTIONS] = std::array::from_fn(|_| Vec::new());
         for e in edgels {
-            bins[(e.direction / STEP + 0.5) as usize % DIRECTIONS].push(*e);
+            let steps = e.direction / STEP;
+            let nearest = (steps + 0.5) as usize;
+            let (x, y) = (usize::from(e.x), usize::from(e.y));
+            bins[nearest % DIRECTIONS].push(Point {
+                at: [y * width + x, x * height + y].map(|i| i as u32),
+                lean: ((steps - nearest as f32) * STEP_PRICE) as i32,
+            });
         }
         let mut values = Vec::new();
         let mut tables = Vec::with_capacity(DIRECTIONS * (width + 1) * (height + 1));
         let planes = (0..DIRECTIONS)
-            .map(|k| {
-                let near = (k + DIRECTIONS - SPREAD)..=(k + DIRECTIONS + SPREAD);
-                let edgels = near.flat_map(|b| &bins[b % DIRECTIONS]);
-                Plane::new(edgels, k as f32 * STEP, width, height, &mut values, &mut tables)
-            })
+            .map(|k| Plane::new(&bins, k, width, height, &mut values, &mut tables))
             .collect();
         Field { planes, tables }
     }
@@ -115,69 +128,42 @@ fn nearest(value: f32) -> i32 {
 }
 
 impl Plane {
-    fn new<'a>(
-        edgels: impl Iterator<Item = &'a Edgel>,
-        angle: f32,
+    fn new(
+        bins: &[Vec<Point>; DIRECTIONS],
+        direction: usize,
         width: usize,
         height: usize,
         values: &mut Vec<u16>,
         tables: &mut Vec<u16>,
     ) -> Self {
-        let (sin, cos) = angle.sin_cos();
+        let (sin, cos) = (direction as f32 * STEP).sin_cos();
         let transposed = sin.abs() < cos.abs();
         let (rows, cols) = if transposed { (width, height) } else { (height, width) };
         let lean = if transposed { sin / cos } else { cos / sin };
-        let cap = (CAP_PX * f32::from(UNIT)) as u16;
         values.clear();
-        values.resize(rows * cols, cap);
-        for e in edgels {
-            let mut turn = e.direction - angle;
-            if turn.abs() > PI / 2.0 {
-                turn -= PI.copysign(turn);
-            }
-            let price = turn.abs() * ANGLE_PRICE;
-            if price < CAP_PX {
-                let (row, col) = if transposed { (e.x, e.y) } else { (e.y, e.x) };
-                let value = &mut values[usize::from(row) * cols + usize::from(col)];
-                *value = ((price * f32::from(UNIT)) as u16).min(*value);
+        values.resize(rows * cols, (CAP_PX * f32::from(UNIT)) as u16);
+        for step in 0..=2 * SPREAD {
+            let turned = (step as f32 - SPREAD as f32) * STEP_PRICE;
+            for point in &bins[(direction + DIRECTIONS + step - SPREAD) % DIRECTIONS] {
+                let price = (turned as i32 + point.lean).unsigned_abs() as u16;
+                let value = &mut values[point.at[usize::from(transposed)] as usize];
+                *value = price.min(*value);
             }
         }
         // Distance across the line to a column k away.
         let step = f32::from(UNIT) / (1.0 + lean * lean).sqrt();
-        let prices = [1, 2, FURTHEST, 2].map(|k| (k, (step * k as f32) as u16));
-        spread(values, cols, &prices);
+        let prices = HOPS.map(|k| (step * k as f32) as u16);
         let shift: Vec<i32> = (0..rows).map(|r| (r as f32 * lean).round() as i32).collect();
-        let total: u64 = values.iter().map(|&v| u64::from(v)).sum();
+        let start = tables.len();
+        let total = integrate(values, cols, &prices, &shift, tables);
         let mean = total as f32 / values.len().max(1) as f32;
-        let plane = Plane { transposed, rows, cols, shift, start: tables.len(), mean };
-        plane.integrate(values, tables);
-        plane
+        Plane { transposed, rows, cols, shift, start, mean }
     }
 
     /// The column of the same line one row further up; `None` beyond the border.
     fn step_back(&self, row: usize, col: i32) -> Option<usize> {
         let delta = if row == 0 { 0 } else { self.shift[row] - self.shift[row - 1] };
         usize::try_from(col - delta).ok().filter(|&c| c < self.cols && row > 0)
-    }
-
-    /// Appends the plane's table. Its row `r + 1` holds, at column c, the sum along the line that passes (r, c),
-    /// down to and including row r.
-    fn integrate(&self, values: &[u16], tables: &mut Vec<u16>) {
-        let cols = self.cols;
-        tables.resize(self.start + cols, 0);
-        for (r, row) in values.chunks_exact(cols).enumerate() {
-            tables.extend_from_slice(row);
-            if r == 0 {
-                continue;
-            }
-            let (done, target) = tables[self.start..].split_at_mut((r + 1) * cols);
-            let above = &done[r * cols..];
-            match self.shift[r] - self.shift[r - 1] {
-                1 => add(&mut target[1..], &above[..cols - 1]),
-                -1 => add(&mut target[..cols - 1], &above[1..]),
-                _ => add(target, above),
-            }
-        }
     }
 
     fn evidence(&self, table: &[u16], from: (f32, f32), to: (f32, f32), length: f32) -> (f32, f32) {
@@ -208,29 +194,62 @@ impl Plane {
     }
 }
 
-/// Furthest step of [`spread`].
-const FURTHEST: usize = 4;
+/// Columns that one pass of [`integrate`] reaches across, longer ones later: as far as the cap.
+const HOPS: [usize; 3] = [1, 2, 4];
+/// Columns that are worked on at once.
+const LANES: usize = 16;
+/// What no price makes overflow or best.
+const NOTHING: u16 = u16::MAX / 2;
 
-/// `row[x] = min(row[x], row[x - k] + price, row[x + k] + price)` for every row, for each k in turn.
+/// Spreads the values of every row to the columns beside them, `row[x] = min(row[x], row[x - k] +
+/// price, row[x + k] + price)` for each hop k in turn, and appends the plane's table: its row `r + 1`
+/// holds, at column c, the sum along the line that passes (r, c), down to and including row r.
+/// Returns the sum of all values.
 #[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
-fn spread(values: &mut [u16], cols: usize, prices: &[(usize, u16)]) {
-    // Beyond the border lies nothing: values that no price makes overflow or best.
-    let mut spare = vec![u16::MAX / 2; cols + 2 * FURTHEST];
-    for row in values.chunks_exact_mut(cols) {
-        for &(k, price) in prices {
-            spare[FURTHEST..FURTHEST + cols].copy_from_slice(row);
-            let left = &spare[FURTHEST - k..][..cols];
-            let right = &spare[FURTHEST + k..][..cols];
-            for ((value, &l), &r) in row.iter_mut().zip(left).zip(right) {
-                *value = (*value).min(l.min(r) + price);
+fn integrate(
+    values: &[u16],
+    cols: usize,
+    prices: &[u16; 3],
+    shift: &[i32],
+    tables: &mut Vec<u16>,
+) -> u64 {
+    const MARGIN: usize = HOPS[2];
+    let padded = cols.next_multiple_of(LANES);
+    let mut here = vec![NOTHING; padded + 2 * MARGIN];
+    let mut there = here.clone();
+    let mut total = 0;
+    let start = tables.len();
+    tables.resize(start + cols, 0);
+    for (r, row) in values.chunks_exact(cols).enumerate() {
+        here[MARGIN..MARGIN + cols].copy_from_slice(row);
+        here[MARGIN + cols..].fill(NOTHING);
+        for (&k, &price) in HOPS.iter().zip(prices) {
+            let from = |first: usize| &here[first..][..padded];
+            let beside = from(MARGIN - k).iter().zip(from(MARGIN + k));
+            let out = there[MARGIN..][..padded].iter_mut();
+            for ((out, own), (left, right)) in out.zip(from(MARGIN)).zip(beside) {
+                *out = (*own).min((*left).min(*right) + price);
+            }
+            std::mem::swap(&mut here, &mut there);
+        }
+        let row = &here[MARGIN..MARGIN + cols];
+        total += u64::from(row.iter().map(|&v| u32::from(v)).sum::<u32>());
+        tables.extend_from_slice(row);
+        if r > 0 {
+            let (done, target) = tables[start..].split_at_mut((r + 1) * cols);
+            let above = &done[r * cols..];
+            match shift[r] - shift[r - 1] {
+                1 => add(&mut target[1..], &above[..cols - 1]),
+                -1 => add(&mut target[..cols - 1], &above[1..]),
+                _ => add(target, above),
             }
         }
     }
+    total
 }
 
-#[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
+#[inline(always)]
 fn add(target: &mut [u16], source: &[u16]) {
-    let source = &source[..target.len()];
     for (t, s) in target.iter_mut().zip(source) {
         *t = t.wrapping_add(*s);
     }
