@@ -40,6 +40,9 @@ const SEARCH_BLUR_PX: f32 = 0.7;
 /// is averaged along the contour instead, where nothing else is lost.
 const PLACE_BLUR_PX: f32 = 0.35;
 
+/// Passes at full resolution, down to how well edges fit.
+const FINE: [Pass; 2] = [Pass::new(0.6, 4.0, 2.5, true), FINAL];
+
 /// Alternatives reported.
 const MOST_ALTERNATIVES: usize = 4;
 
@@ -253,7 +256,7 @@ impl Search<'_> {
             s /= 2.0;
             passes.push(Pass::new(s, 4.0 * s, 2.5 * s, true));
         }
-        passes.extend([Pass::new(0.6, 4.0, 2.5, true), FINAL]);
+        passes.extend(FINE);
         self.refine(&mut refined, &passes);
         self.both(refined)
     }
@@ -317,7 +320,7 @@ impl Search<'_> {
             .filter(stands)
             .map(|pose| {
                 let mut twin = Refined { pose, ..of.without_sites() };
-                self.refine(&mut twin, &[Pass::new(0.6, 4.0, 2.5, true), FINAL, FINAL]);
+                self.refine(&mut twin, &FINE);
                 self.both(twin)
             })
             .collect()
