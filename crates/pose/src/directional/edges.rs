@@ -4,6 +4,8 @@
 //! noise, with the direction of the edge. No threshold is set by hand: the noise is measured in the
 //! picture and the factor gives about one false point in three thousand pixels of pure noise.
 
+use std::f32::consts::{FRAC_PI_2, FRAC_PI_4, PI};
+
 use super::level::Level;
 
 /// How many noise deviations a gradient must exceed: exp(-k^2 / 2) of noise pixels do.
@@ -37,12 +39,23 @@ pub fn edgels(level: &Level) -> Vec<Edgel> {
             }
             let (gx, gy) = (gx[i], gy[i]);
             if is_ridge(&magnitude, width, i, gx, gy) {
-                let direction = gx.atan2(-gy).rem_euclid(std::f32::consts::PI);
-                out.push(Edgel { x: x as u16, y: y as u16, direction });
+                out.push(Edgel { x: x as u16, y: y as u16, direction: line_direction(-gy, gx) });
             }
         }
     }
     out
+}
+
+/// Direction of a line along this vector: 0 to pi (rad), right to 0.004, which shifts no edge and is
+/// an eighth of what rounding to a direction of the fields does.
+pub fn line_direction(dx: f32, dy: f32) -> f32 {
+    // The arc tangent on [-1, 1].
+    let atan = |t: f32| t * (FRAC_PI_4 + 0.273 * (1.0 - t.abs()));
+    if dx.abs() < dy.abs() {
+        return FRAC_PI_2 - atan(dx / dy);
+    }
+    let direction = if dx == 0.0 { 0.0 } else { atan(dy / dx) };
+    if direction < 0.0 { direction + PI } else { direction }
 }
 
 /// Largest along the gradient: against its neighbours interpolated on the 3x3 square.

@@ -14,7 +14,7 @@ use std::f32::consts::PI;
 
 use multiversion::multiversion;
 
-use super::edges::Edgel;
+use super::edges::{Edgel, line_direction};
 
 /// Directions over 180 degrees: six degrees apart, so a 40 px segment bends 1 px at its ends.
 pub const DIRECTIONS: usize = 30;
@@ -112,14 +112,7 @@ impl Field {
 
 /// Index of the direction nearest to that of a vector.
 fn nearest_direction(dx: f32, dy: f32) -> usize {
-    // atan on [-1, 1] to 0.004 rad, an eighth of the error of rounding to a direction.
-    let atan = |t: f32| t * (PI / 4.0 + 0.273 * (1.0 - t.abs()));
-    let angle = match dx.abs() >= dy.abs() {
-        true if dx == 0.0 => 0.0,
-        true => atan(dy / dx),
-        false => PI / 2.0 - atan(dx / dy),
-    };
-    (angle / STEP + DIRECTIONS as f32 + 0.5) as usize % DIRECTIONS
+    (line_direction(dx, dy) / STEP + 0.5) as usize % DIRECTIONS
 }
 
 /// Nearest whole number of a value above -4096.

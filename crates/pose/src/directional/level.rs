@@ -6,6 +6,7 @@
 //! gives those. Only the region is worked on, so the time depends on the object's size in pixels, not
 //! on the camera's resolution.
 
+use multiversion::multiversion;
 use vergence_imaging::{Image, kernel};
 
 /// A gradient's noise is never taken to be lower (grey levels per pixel): quantisation.
@@ -188,25 +189,37 @@ fn reduce(image: &Image<u8>, region: &Region, scale: usize) -> Image<f32> {
     out
 }
 
+/// Response bins to a grey level of [`grey_noise`], and the last bin.
+const FINE: f32 = 4.0;
+const MOST: f32 = 1023.0;
+
+/// Bins of a row's responses, its neighbours above and below.
+#[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
+fn responses(above: &[f32], row: &[f32], below: &[f32], bins: &mut [u16]) {
+    let n = bins.len();
+    let [a, b, c] = [&above[..n], &above[1..][..n], &above[2..][..n]];
+    let [d, e, f] = [&row[..n], &row[1..][..n], &row[2..][..n]];
+    let [g, h, i] = [&below[..n], &below[1..][..n], &below[2..][..n]];
+    for k in 0..n {
+        let (corners, sides) = (a[k] + c[k] + g[k] + i[k], b[k] + h[k] + d[k] + f[k]);
+        let response = (corners - 2.0 * sides + 4.0 * e[k]).abs();
+        bins[k] = (response * FINE).min(MOST) as u16;
+    }
+}
+
 /// Standard deviation of the noise (grey levels), from the median response to a mask that is blind
 /// to planes and to straight steps along rows and columns (Immerkaer's, with a median so that
 /// corners and texture do not count).
 fn grey_noise(image: &Image<f32>) -> f32 {
-    /// Response bins to a grey level.
-    const FINE: f32 = 4.0;
     let (width, height) = (image.width(), image.height());
     if width < 3 || height < 3 {
         return 0.0;
     }
     let mut histogram = [0usize; 1024];
+    let mut bins = vec![0u16; width - 2];
     for y in (1..height - 1).step_by(2) {
-        let (a, b, c) = (image.row(y - 1), image.row(y), image.row(y + 1));
-        for x in 1..width - 1 {
-            let corners = a[x - 1] + a[x + 1] + c[x - 1] + c[x + 1];
-            let sides = a[x] + c[x] + b[x - 1] + b[x + 1];
-            let response = (corners - 2.0 * sides + 4.0 * b[x]).abs();
-            histogram[((response * FINE) as usize).min(1023)] += 1;
-        }
+        responses(image.row(y - 1), image.row(y), image.row(y + 1), &mut bins);
+        bins.iter().for_each(|&b| histogram[usize::from(b)] += 1);
     }
     let half = histogram.iter().sum::<usize>() / 2;
     let mut below = 0;

@@ -7,7 +7,7 @@
 //! weighs them all.
 
 use nalgebra::{Matrix3, Point3, RowSVector, RowVector2, Unit, Vector2, Vector3};
-use vergence_geometry::{Transform, gaussian::skew};
+use vergence_geometry::Transform;
 
 use super::level::Level;
 use super::search::Sight;
@@ -209,8 +209,9 @@ pub fn sites(
             let across = normal * by_point;
             let by_base = across * optical_from_base;
             let lever = pose.rotation * in_object;
-            let by_rotation = by_base * -skew(&lever);
-            let by_camera = across * -skew(&p.coords);
+            // v' (turn x lever) = turn' (lever x v): no matrices.
+            let by_rotation = lever.cross(&by_base.transpose()).transpose();
+            let by_camera = p.coords.cross(&across.transpose());
             let mut by_shared = ByShared::zeros();
             by_shared.fixed_columns_mut::<3>(0).copy_from(&by_rotation);
             by_shared.fixed_columns_mut::<3>(3).copy_from(&by_base);
