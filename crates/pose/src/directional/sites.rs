@@ -174,6 +174,8 @@ pub fn sites(
     };
     let up_in_object = up.map(|up| pose.rotation.inverse() * up.into_inner());
     let mut profile = Vec::new();
+    // Contour since the last site of the part under way: short chords of a curve share one.
+    let (mut part, mut since) = (None, 0.0);
     for segment in &contour {
         let [from, to] =
             [segment.from, segment.to].map(|p| optical_from_object * Point3::from(p * size));
@@ -182,6 +184,14 @@ pub fn sites(
         if length < 0.3 {
             continue;
         }
+        if part.replace((segment.part, segment.kind)) != Some((segment.part, segment.kind)) {
+            since = 0.0;
+        }
+        since += length;
+        if since < LEAST_SPACING * layout.spacing_px {
+            continue;
+        }
+        let stands_for = std::mem::take(&mut since);
         let contact = match (segment.away, up_in_object) {
             (Some(away), Some(up)) => away.dot(&up) < -CONTACT_COS,
             _ => false,
@@ -230,7 +240,7 @@ pub fn sites(
                 kind: segment.kind,
                 pixel: (pixel.x, pixel.y),
                 normal: (normal.x, normal.y),
-                length: length / n as f64,
+                length: stands_for / n as f64,
                 px_per_metre: camera.fx / p.z,
                 contact,
                 by_shared,
@@ -246,6 +256,8 @@ pub fn sites(
     }
 }
 
+/// Share of the spacing that sites keep at least.
+const LEAST_SPACING: f64 = 0.7;
 /// Cosine above which a face that turns away counts as the one that the object rests on.
 const CONTACT_COS: f64 = 0.99;
 
