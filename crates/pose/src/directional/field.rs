@@ -187,7 +187,7 @@ impl Plane {
     }
 }
 
-/// Columns that one pass of [`integrate`] reaches across, longer ones later: as far as the cap.
+/// Columns that one pass of [`integrate`] reaches across, longer ones later: about as far as the cap.
 const HOPS: [usize; 3] = [1, 2, 4];
 /// Columns that are worked on at once.
 const LANES: usize = 16;
@@ -245,5 +245,76 @@ fn integrate(
 fn add(target: &mut [u16], source: &[u16]) {
     for (t, s) in target.iter_mut().zip(source) {
         *t = t.wrapping_add(*s);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Edge points strewn over a level, by a small generator of its own so that they repeat.
+    fn strewn(count: u32, width: usize, height: usize) -> Vec<Edgel> {
+        let part = |k: u32, n: u32| k.wrapping_mul(2_654_435_761).rotate_left(13 * n) >> 8;
+        let share = |k, n| part(k, n) as f32 / (1 << 24) as f32;
+        let edgel = |k| Edgel {
+            x: (share(k, 1) * width as f32) as u16,
+            y: (share(k, 2) * height as f32) as u16,
+            direction: share(k, 3) * PI,
+        };
+        (1..=count).map(edgel).collect()
+    }
+
+    #[test]
+    fn values_are_the_least_distance_across_plus_the_price_of_the_turn() {
+        // Rows of all lengths against the vectors' sixteen, and both layouts.
+        for (width, height) in [(37, 21), (32, 48), (19, 16)] {
+            let edgels = strewn(12, width, height);
+            let field = Field::new(&edgels, width, height);
+            for direction in 0..DIRECTIONS {
+                let angle = direction as f32 * STEP;
+                let (sin, cos) = angle.sin_cos();
+                for (x, y) in (0..width).flat_map(|x| (0..height).map(move |y| (x, y))) {
+                    let prices = edgels.iter().filter_map(|e| {
+                        let turn = (e.direction - angle + 1.5 * PI) % PI - 0.5 * PI;
+                        let turned = turn.abs() <= (SPREAD as f32 + 0.5) * STEP;
+                        let dx = f32::from(e.x) - x as f32;
+                        let dy = f32::from(e.y) - y as f32;
+                        let flat = sin.abs() < cos.abs();
+                        let (along, across) = if flat { (dx, dy * cos) } else { (dy, dx * sin) };
+                        let steps = if flat { dy } else { dx };
+                        let beside = along == 0.0 && steps.abs() <= 7.0 && turned;
+                        beside.then(|| across.abs() + turn.abs() * ANGLE_PRICE)
+                    });
+                    let expected = prices.fold(CAP_PX, f32::min);
+                    let found = field.value(direction, x, y);
+                    // Every price is cut to a sixteenth, three hops and the turn at most.
+                    let error = expected - found;
+                    assert!((-0.07..0.4).contains(&error), "{direction} ({x}, {y}): {error}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_segment_reads_what_its_pixels_hold() {
+        let (width, height) = (45, 33);
+        let field = Field::new(&strewn(40, width, height), width, height);
+        // Upright and flat: pixels that need no rounding.
+        for (from, to, direction) in [((9, 4), (9, 30), DIRECTIONS / 2), ((40, 12), (3, 12), 0)] {
+            let (columns, rows) =
+                (from.0.min(to.0)..from.0.max(to.0), from.1.min(to.1)..from.1.max(to.1));
+            let pixels: Vec<(usize, usize)> = if direction == 0 {
+                columns.map(|x| (x, from.1)).collect()
+            } else {
+                rows.map(|y| (from.0, y)).collect()
+            };
+            let sum: f32 = pixels.iter().map(|p| field.value(direction, p.0, p.1)).sum();
+            let length = pixels.len() as f32;
+            let at = |p: (usize, usize)| (p.0 as f32, p.1 as f32);
+            let (evidence, counted) = field.evidence(at(from), at(to));
+            assert!((counted - length).abs() < 1e-3, "{counted} of {length}");
+            let expected = field.planes[direction].mean / f32::from(UNIT) * length - sum;
+            assert!((evidence - expected).abs() < 1e-2, "{evidence} for {expected}");
+        }
     }
 }
