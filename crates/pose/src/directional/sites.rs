@@ -257,7 +257,7 @@ pub fn sites(
 }
 
 /// Share of the spacing that sites keep at least.
-const LEAST_SPACING: f64 = 0.7;
+const LEAST_SPACING: f64 = 0.5;
 /// Cosine above which a face that turns away counts as the one that the object rests on.
 const CONTACT_COS: f64 = 0.99;
 
