@@ -70,12 +70,6 @@ pub(super) struct Edge<'a> {
     pub residual: f64,
 }
 
-impl Edge<'_> {
-    fn piece(&self) -> u32 {
-        (self.site.along / PIECE) as u32
-    }
-}
-
 /// Sites in the order in which they share errors: by [`part_of`], piece and view.
 pub(super) fn by_part(sites: &[Site]) -> Vec<&Site> {
     let mut sorted: Vec<(u64, &Site)> = sites.iter().map(|s| (order(s), s)).collect();
@@ -85,8 +79,12 @@ pub(super) fn by_part(sites: &[Site]) -> Vec<&Site> {
 }
 
 fn order(site: &Site) -> u64 {
-    let piece = (site.along / PIECE) as u32;
-    u64::from(part_of(site)) << 40 | u64::from(piece) << 8 | site.view as u64
+    u64::from(part_of(site)) << 40 | u64::from(piece_of(site)) << 8 | site.view as u64
+}
+
+/// Which piece of its part a site is in.
+fn piece_of(site: &Site) -> u32 {
+    (site.along / PIECE) as u32
 }
 
 /// Part and kind: what errs together.
@@ -247,10 +245,11 @@ fn normal_equations(
 ) -> (SMatrix<f64, WITH_PART, WITH_PART>, SVector<f64, WITH_PART>) {
     let mut a = [[0.0; PADDED]; PADDED];
     let mut b = [0.0; PADDED];
-    let (first, last) = (edges[0].piece(), edges[edges.len() - 1].piece());
-    for piece in edges.chunk_by(|a, b| a.piece() == b.piece()) {
+    let at = |e: &Edge| piece_of(e.site);
+    let (first, last) = (at(&edges[0]), at(&edges[edges.len() - 1]));
+    for piece in edges.chunk_by(|a, b| at(a) == at(b)) {
         // From -1 to 1 along the part.
-        let place = f64::from(2 * (piece[0].piece() - first)) / f64::from((last - first).max(1));
+        let place = f64::from(2 * (at(&piece[0]) - first)) / f64::from((last - first).max(1));
         let place = if last > first { place - 1.0 } else { 0.0 };
         let mut of_piece = [0.0; PADDED];
         let (mut information, mut moment) = (0.0, 0.0);
@@ -306,6 +305,7 @@ fn add(to: &mut [f64; PADDED], scale: f64, v: &[f64; PADDED]) {
 /// Adds `weight v v'`, from the diagonal's lanes on: the rest is the same.
 #[inline(always)]
 fn add_outer(a: &mut [[f64; PADDED]; PADDED], weight: f64, v: &[f64; PADDED]) {
+    const { assert!(PADDED == 5 * LANES, "one line for the rows of each vector") };
     add_rows::<0>(a, weight, v);
     add_rows::<1>(a, weight, v);
     add_rows::<2>(a, weight, v);

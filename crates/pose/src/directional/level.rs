@@ -12,8 +12,8 @@ use vergence_imaging::{Image, kernel};
 /// A gradient's noise is never taken to be lower (grey levels per pixel): quantisation.
 const NOISE_FLOOR: f32 = 0.12;
 
-/// Parts of a pixel in fixed point.
-const FIXED: f64 = (1 << 24) as f64;
+/// Binary places of a pixel in fixed point.
+const PLACES: u32 = 24;
 
 /// A rectangle of pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -137,8 +137,10 @@ impl Level {
         let half = (reach * along.abs()).ceil() + 2.0;
         let first = main.round() - sense * half;
         let data = self.smooth.data();
-        // The place between rows in parts of 2^24: whole and share without rounding or saturation.
-        let fixed = |v: f64| (v * FIXED) as i64;
+        // The place between rows in fixed point: whole and share by a shift and a mask, which cost
+        // less than conversions that saturate.
+        const ONE: i64 = 1 << PLACES;
+        let fixed = |v: f64| (v * ONE as f64) as i64;
         let (start, slant) = (fixed(cross + lean * (first - main)), fixed(sense * lean));
         let (forward, last, count) = (sense as i64, size as i64 - 1, 2 * half as i64 + 1);
         let (least, most) = (fixed(1.0), fixed(cross_size as f64 - 2.0));
@@ -146,8 +148,8 @@ impl Level {
         let inside =
             |(at, place): (i64, i64)| at >= 1 && at < last && place >= least && place < most;
         let value = |(at, place): (i64, i64)| {
-            let share = (place & (FIXED as i64 - 1)) as f32 * (1.0 / FIXED as f32);
-            let i = at as usize * stride + (place >> 24) as usize * cross_stride;
+            let share = (place & (ONE - 1)) as f32 * (1.0 / ONE as f32);
+            let i = at as usize * stride + (place >> PLACES) as usize * cross_stride;
             let (a, b) = (data[i], data[i + cross_stride]);
             a + share * (b - a)
         };

@@ -184,8 +184,9 @@ pub fn sites(
         if length < 0.3 {
             continue;
         }
-        if part.replace((segment.part, segment.kind)) != Some((segment.part, segment.kind)) {
-            since = 0.0;
+        let here = Some((segment.part, segment.kind));
+        if part != here {
+            (part, since) = (here, 0.0);
         }
         since += length;
         if since < LEAST_SPACING * layout.spacing_px {
