@@ -30,18 +30,27 @@ pub fn edgels(level: &Level) -> Vec<Edgel> {
     let (gx, gy) = (gx.data(), gy.data());
     let magnitude: Vec<f32> = gx.iter().zip(gy).map(|(gx, gy)| gx * gx + gy * gy).collect();
     let mut out = Vec::new();
-    for y in 1..height.saturating_sub(1) {
-        for x in 1..width.saturating_sub(1) {
-            let i = y * width + x;
-            let m = magnitude[i];
-            if m <= threshold2 {
-                continue;
-            }
-            let (gx, gy) = (gx[i], gy[i]);
-            if is_ridge(&magnitude, width, i, gx, gy) {
-                out.push(Edgel { x: x as u16, y: y as u16, direction: line_direction(-gy, gx) });
-            }
+    let mut kept = vec![0; width];
+    for row in (1..height.saturating_sub(1)).map(|y| y * width) {
+        // Lists without branches: which pixels pass cannot be foreseen.
+        let mut count = 0;
+        for (x, m) in magnitude[row..row + width].iter().enumerate() {
+            kept[count] = x;
+            count += usize::from(*m > threshold2);
         }
+        let strong = count;
+        count = 0;
+        for k in 0..strong {
+            let x = kept[k];
+            kept[count] = x;
+            let i = row + x;
+            count += usize::from(is_ridge(&magnitude, width, i, gx[i], gy[i]));
+        }
+        out.extend(kept[..count].iter().map(|&x| Edgel {
+            x: x as u16,
+            y: (row / width) as u16,
+            direction: line_direction(-gy[row + x], gx[row + x]),
+        }));
     }
     out
 }
@@ -61,14 +70,16 @@ pub fn line_direction(dx: f32, dy: f32) -> f32 {
 /// Largest along the gradient: against its neighbours interpolated on the 3x3 square.
 fn is_ridge(magnitude: &[f32], width: usize, i: usize, gx: f32, gy: f32) -> bool {
     let (ax, ay) = (gx.abs(), gy.abs());
-    let diagonal = if (gx < 0.0) == (gy < 0.0) { width + 1 } else { width - 1 };
-    let (straight, share) = if ax >= ay { (1, ay / ax) } else { (width, ax / ay) };
-    let (ahead, behind) = if ax >= ay && diagonal == width - 1 {
-        // Right goes with up here: the neighbour pair is (right, right-up) and (left, left-down).
-        ((i + straight, i - diagonal), (i - straight, i + diagonal))
-    } else {
-        ((i + straight, i + diagonal), (i - straight, i - diagonal))
+    let (most, least, straight) = if ax >= ay { (ax, ay, 1) } else { (ay, ax, width) };
+    // Down, a column to the right or to the left; where right goes with up, the way back.
+    let same = (gx < 0.0) == (gy < 0.0);
+    let diagonal = if same { width + 1 } else { width - 1 };
+    let (ahead, behind) = (i + diagonal, i - diagonal);
+    let (ahead, behind) = if !same && ax >= ay { (behind, ahead) } else { (ahead, behind) };
+    // How much lower it is there, times the larger slope.
+    let here = magnitude[i];
+    let drop = |straight: usize, diagonal: usize| {
+        most * (here - magnitude[straight]) + least * (magnitude[straight] - magnitude[diagonal])
     };
-    let mix = |(a, b): (usize, usize)| magnitude[a] + share * (magnitude[b] - magnitude[a]);
-    magnitude[i] > mix(ahead) && magnitude[i] >= mix(behind)
+    (drop(i + straight, ahead) > 0.0) & (drop(i - straight, behind) >= 0.0)
 }
