@@ -280,7 +280,7 @@ impl Search<'_> {
     fn weigh(&self, mut refined: Refined, pass: &Pass) -> (Refined, Explained) {
         self.lay_out(&mut refined, pass);
         let mut explained = verdict::weigh(&refined.sites, pass.layout.range_px, pass.sd_px);
-        explained.evidence -= refined.strain;
+        explained.evidence -= self.strain(&refined);
         (refined, explained)
     }
 

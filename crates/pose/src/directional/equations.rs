@@ -58,6 +58,13 @@ pub(super) struct Move {
     pub own: Vec<Vector2<f64>>,
 }
 
+impl Move {
+    /// None at all.
+    pub fn none(views: usize) -> Self {
+        Move { shared: SVector::zeros(), own: vec![Vector2::zeros(); views] }
+    }
+}
+
 /// One measurement of a site.
 pub(super) struct Edge<'a> {
     /// The site.

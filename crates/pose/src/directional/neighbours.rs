@@ -2,16 +2,18 @@
 //!
 //! **In:** the best refined pose. **Out:** the mean of its neighbourhood, with a covariance that holds
 //! all of it. Print, lips and shadows run parallel to the contour a pixel or two away, and a
-//! refinement stops at the first place that fits: the likelihood has several tops. The refinement is
-//! started again from where the contour lies a few pixels off, in every direction in which a pose can
-//! move it and there are edges. The distinct tops are components of a mixture: its mean is the estimate, its second moment
-//! about that, with the odds taken less seriously, the covariance. So a pose whose edges are certain
-//! gets a small one, and a pose that might sit on the wrong line of print says so.
+//! refinement stops at the first place that fits: the likelihood has several tops. The contour is
+//! moved a few pixels in every direction in which a pose can move it and there are edges, and glides
+//! from there on the edges that were found around the best pose, which takes most starts back to it.
+//! What ends elsewhere and explains enough is refined on its own. The distinct tops are components of
+//! a mixture: its mean is the estimate, its second moment about that, with the odds taken less
+//! seriously, the covariance. So a pose whose edges are certain gets a small one, and a pose that might
+//! sit on the wrong line of print says so.
 
 use nalgebra::{Matrix6, Vector6};
-use vergence_geometry::Transform;
 use vergence_geometry::gaussian::{difference, perturb};
 
+use super::equations::{Move, by_part};
 use super::refine::{EDGE_SD_PX, FINAL, Pass, Refined};
 use super::search::Search;
 use super::sites::Site;
@@ -26,14 +28,20 @@ const AROUND: (f64, f64) = (1.8, 4.0);
 const WORTH_A_START: f64 = 0.3;
 const MOVES: f64 = 0.4;
 const NEAR: f64 = 0.5;
-/// A start that comes this near (px) to a known optimum will end there.
+/// What comes this near (px) to a known optimum will end there.
 const CAUGHT_PX: f64 = 0.4;
-/// How a start is refined; before all passes are done most are caught.
-const PASSES: [Pass; 4] =
-    [Pass::new(1.0, 4.0, 5.0, true), Pass::new(0.6, 3.0, 4.0, true), FINAL, FINAL];
-/// What the tops that count are refined by at last: a site at every pixel. Where sites happen to fall
-/// on print and noise no longer matters, and the long passes before it can do with fewer.
+/// Deviations (px) with which a start glides, one after the other.
+const GLIDES: [f64; 2] = [1.0, 0.6];
+/// Passes that refine what did not glide back.
+const PASSES: [Pass; 2] = [FINAL, FINAL];
+/// How it is looked at before, and what it may be behind the best pose (nats of doubt).
+const PROBE: Pass = Pass::new(0.6, 4.0, 4.0, true);
+const HOPELESS: f64 = 5.0;
+/// What the tops that count in the mean, those less behind than this (nats), are refined by at last: a
+/// site at every pixel. Where sites happen to fall on print and noise no longer matters, and the long
+/// passes before it can do with fewer.
 const POLISH: Pass = Pass::new(EDGE_SD_PX, 4.0, 1.0, true);
+const POLISHED: f64 = 6.0;
 /// A direction is left out when it takes more than this (rad or m) to move the contour that far: a
 /// turn about the axis of a solid of revolution.
 const BLIND: f64 = 0.2;
@@ -55,22 +63,15 @@ impl Search<'_> {
             (d.transpose() * metric * d).x.sqrt()
         };
         let mut optima = vec![best.clone()];
-        let mut spare = Vec::new();
         for _ in 0..MOST_TOPS {
             let top = optima[0].clone();
-            for start in self.starts(&top.0, &metric) {
-                let offsets = top.0.offsets.clone();
-                let sites = std::mem::take(&mut spare);
-                let mut trial = Refined { pose: start, offsets, sites, ..top.0.without_sites() };
-                let caught = PASSES.iter().any(|pass| {
-                    self.refine(&mut trial, std::slice::from_ref(pass));
-                    optima.iter().any(|o| apart(&o.0, &trial) < CAUGHT_PX)
-                });
-                if caught {
-                    spare = trial.sites;
-                } else {
-                    optima.push(self.both(trial));
-                }
+            let around = self.around(&top.0);
+            let parts = by_part(&around);
+            let probed = self.weigh(top.0.without_sites(), &PROBE).1;
+            let least = probed.evidence - HOPELESS * DOUBT_NATS;
+            for start in self.starts(&around, &metric) {
+                let known = |r: &Refined| optima.iter().any(|o| apart(&o.0, r) < CAUGHT_PX);
+                optima.extend(self.other_top(&top.0, &start, &parts, least, known));
             }
             optima.sort_by(|a, b| b.1.evidence.total_cmp(&a.1.evidence));
             if optima[0].1.evidence < top.1.evidence + HIGHER {
@@ -80,21 +81,63 @@ impl Search<'_> {
         *best = self.mixture(optima);
     }
 
-    /// Poses whose contours lie off the given one's and near other edges, one for every direction and
-    /// sense at most.
-    fn starts(&self, from: &Refined, metric: &Matrix6<f64>) -> Vec<Transform> {
-        let hop = HOP_PX * self.scale().min(2.0);
-        let mut around = from.without_sites();
-        self.lay_out(&mut around, &Pass::new(1.0, AROUND.0 * hop, AROUND.1, true));
+    /// Where a start ends that is off the top by a tangent, on the sites around the top; `None` where
+    /// that is known or explains less than the least.
+    fn other_top(
+        &self,
+        top: &Refined,
+        start: &Vector6<f64>,
+        parts: &[&Site],
+        least: f64,
+        known: impl Fn(&Refined) -> bool,
+    ) -> Option<(Refined, Explained)> {
+        let mut trial = Refined { offsets: top.offsets.clone(), ..top.without_sites() };
+        let mut moved = Move::none(self.sights.len());
+        moved.shared.fixed_rows_mut::<6>(0).copy_from(start);
+        for sd_px in GLIDES {
+            self.glide(&mut trial, parts, sd_px, &mut moved);
+            let mut here = trial.without_sites();
+            here.apply(&moved);
+            if known(&here) {
+                return None;
+            }
+        }
+        trial.apply(&moved);
+        let (mut trial, probed) = self.weigh(trial, &PROBE);
+        if probed.evidence < least {
+            return None;
+        }
+        for pass in PASSES {
+            self.refine(&mut trial, &[pass]);
+            if known(&trial) {
+                return None;
+            }
+        }
+        Some(self.both(trial))
+    }
+
+    /// The edges around a pose, further off than a refinement looks.
+    fn around(&self, top: &Refined) -> Vec<Site> {
+        let mut around = top.without_sites();
+        self.lay_out(&mut around, &Pass::new(1.0, AROUND.0 * self.hop(), AROUND.1, true));
+        around.sites
+    }
+
+    /// How far the contour is moved (px).
+    fn hop(&self) -> f64 {
+        HOP_PX * self.scale().min(2.0)
+    }
+
+    /// Tangents by which the contour comes off the pose and near other edges, one for every direction
+    /// and sense at most.
+    fn starts(&self, around: &[Site], metric: &Matrix6<f64>) -> Vec<Vector6<f64>> {
+        let hop = self.hop();
         let eigen = metric.symmetric_eigen();
         let lengths = eigen.eigenvalues.map(|e| hop / e.max(1e-9).sqrt());
         let steps = (0..6).filter(|&k| lengths[k] < BLIND);
         let steps = steps.map(|k| eigen.eigenvectors.column(k) * lengths[k]);
-        steps
-            .flat_map(|d: Vector6<f64>| [d, -d])
-            .filter(|d| edges_elsewhere(&around.sites, d, hop) > WORTH_A_START)
-            .map(|d| perturb(&from.pose, &d))
-            .collect()
+        let both = steps.flat_map(|d: Vector6<f64>| [d, -d]);
+        both.filter(|d| edges_elsewhere(around, d, hop) > WORTH_A_START).collect()
     }
 }
 
@@ -132,7 +175,8 @@ impl Search<'_> {
         let explained = optima[0].1;
         let behind = |e: &Explained| explained.evidence - e.evidence;
         optima.retain(|o| behind(&o.1) < MOST_BEHIND * DOUBT_NATS);
-        optima.iter_mut().for_each(|o| self.refine(&mut o.0, &[POLISH]));
+        let count = optima.iter_mut().filter(|o| behind(&o.1) < POLISHED);
+        count.for_each(|o| self.refine(&mut o.0, &[POLISH]));
         let place = optima[0].0.pose;
         let (mut mean, mut beliefs) = (Vector6::zeros(), 0.0);
         for (refined, explained) in &mut optima {

@@ -106,8 +106,6 @@ pub struct Refined {
     pub covariance: Matrix6<f64>,
     /// How far off the parts of the object seem to be from where the record has them.
     pub offsets: Vec<Offsets>,
-    /// What the priors hold against this state: half their squared normalised residuals.
-    pub strain: f64,
     /// The hypothesis that it comes from rests on something level: it stays so while it is refined,
     /// or free attitudes would absorb it, which always explain a little more.
     pub rests: bool,
@@ -121,32 +119,39 @@ type SharedVector = SVector<f64, SHARED>;
 impl Search<'_> {
     /// Refines a state through the given passes.
     pub fn refine(&self, refined: &mut Refined, passes: &[Pass]) {
-        let views = self.sights.len();
         for pass in passes {
             self.lay_out(refined, pass);
             let sites = std::mem::take(&mut refined.sites);
-            let parts = by_part(&sites);
-            // Three steps on the same sites: the assignments settle while the geometry is linear.
-            let mut moved =
-                Move { shared: SharedVector::zeros(), own: vec![Vector2::zeros(); views] };
-            for _ in 0..3 {
-                let Some(step) = self.step(refined, &parts, pass, &moved, 1.0) else { break };
-                moved.shared += step.shared;
-                moved.own.iter_mut().zip(step.own).for_each(|(m, s)| *m += s);
-            }
+            let mut moved = Move::none(self.sights.len());
+            self.glide(refined, &by_part(&sites), pass.sd_px, &mut moved);
             refined.sites = sites;
             refined.apply(&moved);
         }
-        refined.strain = self.strain(refined);
+    }
+
+    /// Moves on from where it has `moved` on the same sites, in the order of [`by_part`]: three steps,
+    /// in which the assignments settle while the geometry is linear. Covariance and offsets are kept
+    /// in `refined`, whose pose stays.
+    pub(super) fn glide(
+        &self,
+        refined: &mut Refined,
+        sites: &[&Site],
+        sd_px: f64,
+        moved: &mut Move,
+    ) {
+        for _ in 0..3 {
+            let Some(step) = self.step(refined, sites, sd_px, moved, 1.0) else { break };
+            moved.shared += step.shared;
+            moved.own.iter_mut().zip(step.own).for_each(|(m, s)| *m += s);
+        }
     }
 
     /// The covariance of a refined pose, with all that sites have in common taken seriously.
     pub fn doubt(&self, refined: &mut Refined, pass: &Pass) {
         self.lay_out(refined, pass);
         let sites = std::mem::take(&mut refined.sites);
-        let views = self.sights.len();
-        let still = Move { shared: SharedVector::zeros(), own: vec![Vector2::zeros(); views] };
-        self.step(refined, &by_part(&sites), pass, &still, DOUBT);
+        let still = Move::none(self.sights.len());
+        self.step(refined, &by_part(&sites), pass.sd_px, &still, DOUBT);
         refined.sites = sites;
     }
 
@@ -170,11 +175,11 @@ impl Search<'_> {
         &self,
         refined: &mut Refined,
         sites: &[&Site],
-        pass: &Pass,
+        sd_px: f64,
         moved: &Move,
         doubt: f64,
     ) -> Option<Move> {
-        let mut equations = Equations::new(self.sights.len(), pass.sd_px, doubt);
+        let mut equations = Equations::new(self.sights.len(), sd_px, doubt);
         let mut edges = Vec::new();
         for part in sites.chunk_by(|a, b| part_of(a) == part_of(b)) {
             edges.clear();
@@ -182,7 +187,7 @@ impl Search<'_> {
                 let turn = site.by_turn * moved.own[site.view];
                 let shift = (site.by_shared * moved.shared).x + turn.x;
                 let lip_shift = site.by_lip * moved.shared[LIP_AT];
-                let found = assign(site, shift, lip_shift, pass.sd_px);
+                let found = assign(site, shift, lip_shift, sd_px);
                 edges.extend(found.map(|(inner, weight, residual)| Edge {
                     site,
                     inner,
@@ -285,8 +290,8 @@ impl Search<'_> {
         (a, b)
     }
 
-    /// Half the squared normalised residuals of all priors.
-    fn strain(&self, state: &Refined) -> f64 {
+    /// What the priors hold against a state: half their squared normalised residuals.
+    pub(super) fn strain(&self, state: &Refined) -> f64 {
         let (residual, _) = self.landmark_residual(state);
         let weight = self.landmark_weight();
         let landmark = (residual.transpose() * weight * residual).x;
@@ -335,12 +340,11 @@ impl Refined {
             turns: vec![Vector2::zeros(); views],
             covariance: Matrix6::identity(),
             offsets: Vec::new(),
-            strain: 0.0,
             sites: Vec::new(),
         }
     }
 
-    fn apply(&mut self, moved: &Move) {
+    pub(super) fn apply(&mut self, moved: &Move) {
         self.pose = perturb(&self.pose, &moved.shared.fixed_rows::<6>(0).into_owned());
         self.form += moved.shared.fixed_rows::<3>(FORM_AT);
         self.turns.iter_mut().zip(&moved.own).for_each(|(turn, step)| *turn += step);
