@@ -248,7 +248,7 @@ impl Point {
         let behind = steps > SLOTS as f32 + SPREAD;
         let steps = if behind { steps - DIRECTIONS as f32 } else { steps };
         let slot = |steps: f32| (steps.max(0.0) as usize).min(SLOTS) as u8;
-        let slots = (slot((steps - SPREAD).ceil()), slot(steps + SPREAD + 1.0));
+        let slots = (slot(steps - SPREAD + 1.0), slot(steps + SPREAD + 1.0));
         Point { col, slots, turn: turn_of(steps) }
     }
 }
