@@ -17,7 +17,9 @@ pub mod search;
 pub mod sites;
 pub mod verdict;
 
-use nalgebra::Vector3;
+use std::f64::consts::PI;
+
+use nalgebra::{Point3, UnitQuaternion, Vector3};
 use vergence_geometry::{GaussianPose, Transform};
 
 use crate::model::Model;
@@ -183,6 +185,30 @@ pub fn track(
     Ok(found)
 }
 
+/// Room for what the object's place and size may be off by (m), and for profiles across its contour
+/// (px).
+const SLACK: f64 = 0.01;
+const MARGIN_PX: f64 = 8.0;
+
+/// Points around all places of an object that is known to stand, whatever its turn about the
+/// vertical: two rings about the landmark's vertical. Empty when it may have any attitude.
+fn around(query: &Query, landmark: Vector3<f64>, half: Vector3<f64>) -> Vec<Point3<f64>> {
+    let (Some(up), Some(true)) = (query.up, query.standing) else { return Vec::new() };
+    const RING: usize = 16;
+    // A polygon of so many corners holds the circle when it is that much larger.
+    let radius = ((landmark.abs() + half).xy().norm() + SLACK) / (PI / RING as f64).cos();
+    let level = UnitQuaternion::rotation_between_axis(&Vector3::z_axis(), &up)
+        .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&Vector3::x_axis(), PI));
+    let heights = [-half.z - SLACK, half.z + SLACK].map(|z| z - landmark.z);
+    let ring = |z: f64| {
+        (0..RING).map(move |k| {
+            let (sin, cos) = (k as f64 * 2.0 * PI / RING as f64).sin_cos();
+            query.landmark.position + level * Vector3::new(radius * cos, radius * sin, z)
+        })
+    };
+    heights.into_iter().flat_map(ring).collect()
+}
+
 /// Levels of the views that can show the object; edges and fields when there is to be a search.
 fn prepare<'a>(
     views: &[View<'a>],
@@ -193,7 +219,8 @@ fn prepare<'a>(
 ) -> Vec<Sight<'a>> {
     let half = Vector3::from(query.record.bounding_box.sides()) / 2.0;
     // The corner furthest from the landmark bounds what the object can reach.
-    let reach = (landmark.abs() + half).norm() + 0.01;
+    let reach = (landmark.abs() + half).norm() + SLACK;
+    let around = around(query, landmark, half);
     views
         .iter()
         .take(equations::VIEWS)
@@ -202,13 +229,23 @@ fn prepare<'a>(
             let p = optical_from_base * query.landmark.position;
             let pixel = view.camera.project(&p)?;
             let depth = (p.z - reach).max(0.5 * p.z);
-            let reach_px = reach * view.camera.fx.max(view.camera.fy) / depth + 8.0;
+            let reach_px = reach * view.camera.fx.max(view.camera.fy) / depth + MARGIN_PX;
             let mut scale = 1;
             while reach_px / scale as f64 > config.reach_px {
                 scale *= 2;
             }
             let (width, height) = (view.image.width(), view.image.height());
-            let region = Region::around((pixel.x, pixel.y), reach_px, width, height)?;
+            let corner = |side: f64| (pixel.x + side * reach_px, pixel.y + side * reach_px);
+            let seen = |p: &Point3<f64>| view.camera.project(&(optical_from_base * p));
+            let around: Option<Vec<_>> = around.iter().map(seen).collect();
+            let corners = around.filter(|a| !a.is_empty()).map_or_else(
+                || vec![corner(-1.0), corner(1.0)],
+                |a| {
+                    let beside = |m: f64| a.iter().map(move |p| (p.x + m, p.y + m));
+                    beside(-MARGIN_PX).chain(beside(MARGIN_PX)).collect()
+                },
+            );
+            let region = Region::of(&corners, width, height)?;
             let full = Reduced::new(view.image, &region, 1);
             let fine = full.smoothed(PLACE_BLUR_PX);
             let reduced = if scale > 1 { Reduced::new(view.image, &region, scale) } else { full };
@@ -235,7 +272,7 @@ impl Search<'_> {
         let s = self.scale();
         let passes = [(2.0, 5.0, 5.0), (1.0, 3.0, 5.0)]
             .map(|(sd, range, spacing)| Pass::new(s * sd, s * range, s * spacing, false));
-        let mut refined = Refined::new(start, rests, self.sights.len());
+        let mut refined = Refined::new(start, rests);
         self.refine(&mut refined, &passes);
         self.weigh(refined, &Pass::new(0.5 * s, 4.0 * s, 3.0 * s, false))
     }

@@ -17,7 +17,7 @@
 //! where a shadow or another object ends beside it).
 
 use multiversion::multiversion;
-use nalgebra::{Matrix4, Matrix6, SMatrix, SVector, Vector2, Vector4};
+use nalgebra::{Cholesky, Const, Matrix6, SMatrix, SVector, Vector2};
 
 use super::sites::{LIP_AT, SHARED, Site};
 
@@ -50,19 +50,12 @@ pub(super) const OFFSET_TAIL: f64 = 2.0;
 const VIEW_TAIL: f64 = 3.0;
 
 /// Changes of the unknowns.
-#[derive(Clone)]
+#[derive(Clone, Default)]
 pub(super) struct Move {
     /// Of those all views share.
     pub shared: SVector<f64, SHARED>,
     /// Of each view's own.
-    pub own: Vec<Vector2<f64>>,
-}
-
-impl Move {
-    /// None at all.
-    pub fn none(views: usize) -> Self {
-        Move { shared: SVector::zeros(), own: vec![Vector2::zeros(); views] }
-    }
+    pub own: [Vector2<f64>; VIEWS],
 }
 
 /// One measurement of a site.
@@ -99,22 +92,26 @@ pub(super) fn part_of(site: &Site) -> u32 {
     3 * u32::from(site.part) + site.kind as u32
 }
 
-/// A part's own unknowns once those of the others are: offset (m), tilt (m at its ends), offset in
+/// Normal equations while they are summed: of all unknowns, then of one part's own.
+struct Sums {
+    /// From the diagonal's vector of lanes on: the rest is the same.
+    a: [[f64; PADDED]; PADDED],
+    b: [f64; PADDED],
+}
+
+/// A part's own unknowns, each by the unknowns before it: offset (m), tilt (m at its ends), offset in
 /// each view (px).
 struct Eliminated {
     part: u32,
-    inverse: Matrix4<f64>,
-    mixed: SMatrix<f64, ALL, PART>,
-    rhs: Vector4<f64>,
+    rows: [[f64; PADDED]; PART],
+    rhs: [f64; PART],
 }
 
 /// The equations while they are built.
 pub(super) struct Equations {
-    views: usize,
     sd_px: f64,
     doubt: f64,
-    a: SMatrix<f64, ALL, ALL>,
-    b: SVector<f64, ALL>,
+    sums: Sums,
     parts: Vec<Eliminated>,
 }
 
@@ -122,74 +119,54 @@ impl Equations {
     /// No measurement yet. `sd_px` is how well edges fit at this stage; `doubt` multiplies the
     /// deviations of all that sites have in common.
     pub fn new(views: usize, sd_px: f64, doubt: f64) -> Self {
-        let mut a = SMatrix::zeros();
+        let mut sums = Sums::new();
         // Views that are not there keep their place; their unknowns stay zero.
         for k in SHARED + OWN * views..ALL {
-            a[(k, k)] = 1.0;
+            sums.a[k][k] = 1.0;
         }
-        let b = SVector::zeros();
-        Equations { views, sd_px, doubt, a, b, parts: Vec::new() }
+        Equations { sd_px, doubt, sums, parts: Vec::with_capacity(16) }
     }
 
     /// Adds the measurements of one part, by piece and view, without what only the part's own offsets
     /// explain. `offsets` are the parts' offsets as last seen.
     pub fn part(&mut self, edges: &[Edge], offsets: &[Offsets]) {
-        let Some(part) = edges.first().map(|e| part_of(e.site)) else { return };
+        let Some(first) = edges.first() else { return };
+        let part = part_of(first.site);
         let seen = offsets.iter().find(|o| o.part == part).copied().unwrap_or_default();
         let scatter = scatter(edges, self.sd_px);
-        let (a, b) = normal_equations(edges, &scatter, (self.doubt * PIECE_SD).powi(-2));
         // Heavy tails: a part that was seen to be off by much may well be off by much.
         let tailed =
             |variance: f64, seen: f64, tail: f64| (tail * variance + seen * seen) / (tail + 1.0);
-        let variance = tailed(edges[0].site.offset_sd().powi(2), seen.shared, OFFSET_TAIL);
+        let shared = tailed(first.site.offset_sd().powi(2), seen.shared, OFFSET_TAIL);
+        let own = |v: usize| {
+            let view = VIEW_SD_PX * VIEW_SD_PX + SCATTER_SHARE * SCATTER_SHARE * scatter[v];
+            tailed(view, seen.own_px[v], VIEW_TAIL)
+        };
         let doubt = self.doubt * self.doubt;
-        let mut inner = a.fixed_view::<PART, PART>(ALL, ALL).into_owned();
-        inner[(0, 0)] += (doubt * variance).recip();
-        inner[(1, 1)] += (doubt * TILT_SD * TILT_SD).recip();
-        for (v, scatter) in scatter.iter().enumerate() {
-            let view = VIEW_SD_PX * VIEW_SD_PX + SCATTER_SHARE * SCATTER_SHARE * scatter;
-            let view = tailed(view, seen.own_px[v], VIEW_TAIL);
-            inner[(2 + v, 2 + v)] += (doubt * view).recip();
-        }
-        let Some(inverse) = inner.try_inverse() else { return };
-        let mixed = a.fixed_view::<ALL, PART>(0, ALL).into_owned();
-        let rhs = b.fixed_rows::<PART>(ALL).into_owned();
-        let lost = mixed * inverse;
-        self.a += a.fixed_view::<ALL, ALL>(0, 0) - lost * mixed.transpose();
-        self.b += b.fixed_rows::<ALL>(0) - lost * rhs;
-        self.parts.push(Eliminated { part, inverse, mixed, rhs });
-    }
-
-    fn add(
-        &mut self,
-        view: usize,
-        js: &SVector<f64, SHARED>,
-        jo: &Vector2<f64>,
-        weight: f64,
-        residual: f64,
-    ) {
-        let at = SHARED + OWN * view;
-        let mut by = SVector::<f64, ALL>::zeros();
-        by.fixed_rows_mut::<SHARED>(0).copy_from(js);
-        by.fixed_rows_mut::<OWN>(at).copy_from(jo);
-        self.a.ger(weight, &by, &by, 1.0);
-        self.b.axpy(weight * residual, &by, 1.0);
+        let priors = std::array::from_fn(|k| match k {
+            0 => (doubt * shared).recip(),
+            1 => (doubt * TILT_SD * TILT_SD).recip(),
+            v => (doubt * own(v - 2)).recip(),
+        });
+        let pieces = (self.doubt * PIECE_SD).powi(-2);
+        let (rows, rhs) = add_part(&mut self.sums, edges, &scatter, pieces, &priors);
+        self.parts.push(Eliminated { part, rows, rhs });
     }
 
     /// Adds information about the shared unknowns.
     pub fn shared(&mut self, a: &SMatrix<f64, SHARED, SHARED>, b: &SVector<f64, SHARED>) {
-        let mut block = self.a.fixed_view_mut::<SHARED, SHARED>(0, 0);
-        block += a;
-        let mut rhs = self.b.fixed_rows_mut::<SHARED>(0);
-        rhs += b;
+        for i in 0..SHARED {
+            (i..SHARED).for_each(|j| self.sums.a[i][j] += a[(i, j)]);
+            self.sums.b[i] += b[i];
+        }
     }
 
     /// Adds a prior on a view's turns: their precision and what is missing to zero.
     pub fn own(&mut self, view: usize, precision: f64, missing: &Vector2<f64>) {
         let at = SHARED + OWN * view;
         for k in 0..OWN {
-            self.a[(at + k, at + k)] += precision;
-            self.b[at + k] += precision * missing[k];
+            self.sums.a[at + k][at + k] += precision;
+            self.sums.b[at + k] += precision * missing[k];
         }
     }
 
@@ -203,25 +180,59 @@ impl Equations {
         residual: &Vector2<f64>,
     ) {
         for k in 0..2 {
-            let (js, jo) = (by_shared.row(k).transpose(), by_own.row(k).transpose());
-            self.add(view, &js, &jo, weight, residual[k]);
+            let mut by = [0.0; PADDED];
+            by.iter_mut().zip(&by_shared.row(k)).for_each(|(b, j)| *b = *j);
+            by[SHARED + OWN * view..].iter_mut().zip(&by_own.row(k)).for_each(|(b, j)| *b = *j);
+            self.sums.add(weight, residual[k], &by);
         }
     }
 
     /// The solution; `None` when it is not determined.
     pub fn solve(self) -> Option<Solution> {
-        let factor = self.a.cholesky()?;
-        let x = factor.solve(&self.b);
-        let unit = SMatrix::<f64, ALL, 6>::identity();
-        let covariance = factor.solve(&unit).fixed_view::<6, 6>(0, 0).into_owned();
-        let own = (0..self.views).map(|v| x.fixed_rows::<OWN>(SHARED + OWN * v).into_owned());
-        let step = Move { shared: x.fixed_rows::<SHARED>(0).into_owned(), own: own.collect() };
-        let offsets = self.parts.iter().map(|p| {
-            let own = p.inverse * (p.rhs - p.mixed.tr_mul(&x));
-            Offsets { part: p.part, shared: own[0], own_px: std::array::from_fn(|v| own[2 + v]) }
-        });
-        let offsets = offsets.collect();
-        Some(Solution { step, covariance, offsets })
+        let above = |i: usize, j: usize| self.sums.a[i.min(j)][i.max(j)];
+        let factor = SMatrix::<f64, ALL, ALL>::from_fn(above).cholesky()?;
+        let x = factor.solve(&SVector::<f64, ALL>::from_column_slice(&self.sums.b[..ALL]));
+        let own = |v| x.fixed_rows::<OWN>(SHARED + OWN * v).into_owned();
+        let shared = x.fixed_rows::<SHARED>(0).into_owned();
+        let step = Move { shared, own: std::array::from_fn(own) };
+        let mut known = [0.0; WITH_PART];
+        known[..ALL].copy_from_slice(x.as_slice());
+        let offsets = self.parts.iter().map(|part| part.offsets(&mut known)).collect();
+        Some(Solution { step, offsets, factor })
+    }
+}
+
+impl Sums {
+    fn new() -> Self {
+        Sums { a: [[0.0; PADDED]; PADDED], b: [0.0; PADDED] }
+    }
+
+    /// Adds a measurement with its derivatives.
+    #[inline(always)]
+    fn add(&mut self, weight: f64, residual: f64, by: &[f64; PADDED]) {
+        add_outer(&mut self.a, weight, by);
+        add(&mut self.b, weight * residual, by);
+    }
+
+    /// Eliminates an unknown that no later one is left of: its row and right-hand side.
+    #[inline(always)]
+    fn eliminate(&mut self, k: usize) -> ([f64; PADDED], f64) {
+        let row = std::array::from_fn(|i| if i <= k { self.a[i][k] } else { 0.0 });
+        let rhs = self.b[k];
+        self.add(-row[k].recip(), rhs, &row);
+        (row, rhs)
+    }
+}
+
+impl Eliminated {
+    /// The part's own unknowns, put behind those that are known.
+    fn offsets(&self, known: &mut [f64; WITH_PART]) -> Offsets {
+        for (k, (row, rhs)) in (ALL..).zip(self.rows.iter().zip(self.rhs)) {
+            let explained: f64 = row[..k].iter().zip(&known[..k]).map(|(a, x)| a * x).sum();
+            known[k] = (rhs - explained) / row[k];
+        }
+        let own_px = std::array::from_fn(|v| known[ALL + 2 + v]);
+        Offsets { part: self.part, shared: known[ALL], own_px }
     }
 }
 
@@ -242,16 +253,21 @@ fn scatter(edges: &[Edge], sd_px: f64) -> [f64; VIEWS] {
     })
 }
 
-/// Normal equations of a part's edges for all unknowns and the part's own, the pieces' offsets
-/// (of that precision, 1/m^2) eliminated.
+/// Adds a part's edges to the equations of all unknowns: the pieces' offsets (of that precision,
+/// 1/m^2) are eliminated, then the part's own unknowns with their priors, of which rows and right-hand
+/// sides are returned.
 #[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
-fn normal_equations(
+fn add_part(
+    total: &mut Sums,
     edges: &[Edge],
     scatter: &[f64; VIEWS],
     precision: f64,
-) -> (SMatrix<f64, WITH_PART, WITH_PART>, SVector<f64, WITH_PART>) {
-    let mut a = [[0.0; PADDED]; PADDED];
-    let mut b = [0.0; PADDED];
+    priors: &[f64; PART],
+) -> ([[f64; PADDED]; PART], [f64; PART]) {
+    let mut sums = Sums::new();
+    for (k, prior) in (ALL..).zip(priors) {
+        sums.a[k][k] = *prior;
+    }
     let at = |e: &Edge| piece_of(e.site);
     let (first, last) = (at(&edges[0]), at(&edges[edges.len() - 1]));
     for piece in edges.chunk_by(|a, b| at(a) == at(b)) {
@@ -284,23 +300,22 @@ fn normal_equations(
             of_site[ALL + 1] = scale * place;
             of_site[ALL + 2 + v] = 1.0;
             let weight = weight / scatter[v];
-            add_outer(&mut a, weight, &of_site);
-            add(&mut b, weight * residual, &of_site);
+            sums.add(weight, residual, &of_site);
             add(&mut of_piece, weight * scale, &of_site);
             information += weight * scale * scale;
             moment += weight * scale * residual;
         }
-        let share = 1.0 / (information + precision);
-        add_outer(&mut a, -share, &of_piece);
-        add(&mut b, -share * moment, &of_piece);
+        sums.add(-1.0 / (information + precision), moment, &of_piece);
     }
-    let mut whole = SMatrix::<f64, WITH_PART, WITH_PART>::zeros();
-    for (i, column) in whole.as_mut_slice().chunks_exact_mut(WITH_PART).enumerate() {
-        column.copy_from_slice(&a[i][..WITH_PART]);
-        let above = &a[..i / LANES * LANES];
-        column.iter_mut().zip(above).for_each(|(c, row)| *c = row[i]);
+    let (mut rows, mut rhs) = ([[0.0; PADDED]; PART], [0.0; PART]);
+    for k in (0..PART).rev() {
+        (rows[k], rhs[k]) = sums.eliminate(ALL + k);
     }
-    (whole, SVector::from_column_slice(&b[..WITH_PART]))
+    for (total, row) in total.a.iter_mut().zip(&sums.a) {
+        add(total, 1.0, row);
+    }
+    add(&mut total.b, 1.0, &sums.b);
+    (rows, rhs)
 }
 
 /// Adds `scale v`.
@@ -347,8 +362,15 @@ pub struct Offsets {
 pub(super) struct Solution {
     /// Changes of the unknowns.
     pub step: Move,
-    /// Covariance of the pose's tangent.
-    pub covariance: Matrix6<f64>,
     /// How far off the parts are.
     pub offsets: Vec<Offsets>,
+    factor: Cholesky<f64, Const<ALL>>,
+}
+
+impl Solution {
+    /// Covariance of the pose's tangent.
+    pub fn covariance(&self) -> Matrix6<f64> {
+        let unit = SMatrix::<f64, ALL, 6>::identity();
+        self.factor.solve(&unit).fixed_view::<6, 6>(0, 0).into_owned()
+    }
 }

@@ -29,14 +29,16 @@ pub struct Region {
 }
 
 impl Region {
-    /// The part of a picture within `reach_px` of a point; `None` when there is none.
-    pub fn around(centre: (f64, f64), reach_px: f64, width: usize, height: usize) -> Option<Self> {
-        let range = |c: f64, size: usize| {
-            let low = (c - reach_px).floor().clamp(0.0, size as f64) as usize;
-            let high = (c + reach_px).ceil().clamp(0.0, size as f64) as usize;
+    /// The part of a picture that holds some points; `None` when there is none.
+    pub fn of(points: &[(f64, f64)], width: usize, height: usize) -> Option<Self> {
+        let range = |at: fn(&(f64, f64)) -> f64, size: usize| {
+            let inside = |c: f64| c.clamp(0.0, size as f64) as usize;
+            let low = points.iter().map(at).fold(f64::INFINITY, f64::min);
+            let high = points.iter().map(at).fold(f64::NEG_INFINITY, f64::max);
+            let (low, high) = (inside(low.floor()), inside(high.ceil()));
             (high > low + 7).then_some((low, high - low))
         };
-        let ((left, width), (top, height)) = (range(centre.0, width)?, range(centre.1, height)?);
+        let ((left, width), (top, height)) = (range(|p| p.0, width)?, range(|p| p.1, height)?);
         Some(Region { left, top, width, height })
     }
 }

@@ -14,7 +14,7 @@ use nalgebra::{Matrix6, Vector6};
 use vergence_geometry::gaussian::{difference, perturb};
 
 use super::equations::{Move, by_part};
-use super::refine::{EDGE_SD_PX, FINAL, Pass, Refined};
+use super::refine::{EDGE_SD_PX, FINAL, Pass, Refined, STEPS};
 use super::search::Search;
 use super::sites::Site;
 use super::verdict::Explained;
@@ -34,9 +34,8 @@ const CAUGHT_PX: f64 = 0.4;
 const GLIDES: [f64; 2] = [1.0, 0.6];
 /// Passes that refine what did not glide back.
 const PASSES: [Pass; 2] = [FINAL, FINAL];
-/// How it is looked at before, and what it may be behind the best pose (nats of doubt).
-const PROBE: Pass = Pass::new(0.6, 4.0, 4.0, true);
-const HOPELESS: f64 = 5.0;
+/// What it may be behind the best pose before (nats of doubt), the edges around either looked at alike.
+const HOPELESS: f64 = 6.0;
 /// What the tops that count in the mean, those less behind than this (nats), are refined by at last: a
 /// site at every pixel. Where sites happen to fall on print and noise no longer matters, and the long
 /// passes before it can do with fewer.
@@ -65,11 +64,10 @@ impl Search<'_> {
         let mut optima = vec![best.clone()];
         for _ in 0..MOST_TOPS {
             let top = optima[0].clone();
-            let around = self.around(&top.0);
-            let parts = by_part(&around);
-            let probed = self.weigh(top.0.without_sites(), &PROBE).1;
-            let least = probed.evidence - HOPELESS * DOUBT_NATS;
-            for start in self.starts(&around, &metric) {
+            let (around, explains) = self.weigh(top.0.without_sites(), &self.wide());
+            let parts = by_part(&around.sites);
+            let least = explains.evidence - HOPELESS * DOUBT_NATS;
+            for start in self.starts(&around.sites, &metric) {
                 let known = |r: &Refined| optima.iter().any(|o| apart(&o.0, r) < CAUGHT_PX);
                 optima.extend(self.other_top(&top.0, &start, &parts, least, known));
             }
@@ -92,10 +90,12 @@ impl Search<'_> {
         known: impl Fn(&Refined) -> bool,
     ) -> Option<(Refined, Explained)> {
         let mut trial = Refined { offsets: top.offsets.clone(), ..top.without_sites() };
-        let mut moved = Move::none(self.sights.len());
+        let mut moved = Move::default();
         moved.shared.fixed_rows_mut::<6>(0).copy_from(start);
         for sd_px in GLIDES {
-            self.glide(&mut trial, parts, sd_px, &mut moved);
+            for _ in 0..STEPS {
+                self.advance(&mut trial, parts, sd_px, &mut moved);
+            }
             let mut here = trial.without_sites();
             here.apply(&moved);
             if known(&here) {
@@ -103,8 +103,8 @@ impl Search<'_> {
             }
         }
         trial.apply(&moved);
-        let (mut trial, probed) = self.weigh(trial, &PROBE);
-        if probed.evidence < least {
+        let (mut trial, explains) = self.weigh(trial, &self.wide());
+        if explains.evidence < least {
             return None;
         }
         for pass in PASSES {
@@ -116,11 +116,9 @@ impl Search<'_> {
         Some(self.both(trial))
     }
 
-    /// The edges around a pose, further off than a refinement looks.
-    fn around(&self, top: &Refined) -> Vec<Site> {
-        let mut around = top.without_sites();
-        self.lay_out(&mut around, &Pass::new(1.0, AROUND.0 * self.hop(), AROUND.1, true));
-        around.sites
+    /// How the edges around a pose are looked at: further off than a refinement does.
+    fn wide(&self) -> Pass {
+        Pass::new(GLIDES[1], AROUND.0 * self.hop(), AROUND.1, true)
     }
 
     /// How far the contour is moved (px).

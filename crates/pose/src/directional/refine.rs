@@ -15,7 +15,7 @@ use nalgebra::{Matrix2, Matrix3, Matrix6, Point3, SMatrix, SVector, Vector2, Vec
 use vergence_geometry::Transform;
 use vergence_geometry::gaussian::{perturb, skew};
 
-use super::equations::{Edge, Equations, Move, Offsets, by_part, part_of};
+use super::equations::{Edge, Equations, Move, Offsets, Solution, VIEWS, by_part, part_of};
 use super::search::Search;
 use super::sites::{FORM_AT, Form, LIP_AT, Layout, SHARED, Site, State, sites};
 use crate::model::Kind;
@@ -83,6 +83,9 @@ pub struct Pass {
     pub fine: bool,
 }
 
+/// Steps on the same sites: the assignments settle while the geometry is linear.
+pub const STEPS: usize = 3;
+
 /// The last pass: full resolution, tight.
 pub const FINAL: Pass = Pass::new(EDGE_SD_PX, 4.0, 2.5, true);
 
@@ -101,7 +104,7 @@ pub struct Refined {
     /// How the object differs from its record.
     pub form: Form,
     /// Small turns of each view's camera about its own x and y axes (rad).
-    pub turns: Vec<Vector2<f64>>,
+    pub turns: [Vector2<f64>; VIEWS],
     /// Covariance of the pose's tangent as the information has it.
     pub covariance: Matrix6<f64>,
     /// How far off the parts of the object seem to be from where the record has them.
@@ -122,27 +125,29 @@ impl Search<'_> {
         for pass in passes {
             self.lay_out(refined, pass);
             let sites = std::mem::take(&mut refined.sites);
-            let mut moved = Move::none(self.sights.len());
-            self.glide(refined, &by_part(&sites), pass.sd_px, &mut moved);
+            let parts = by_part(&sites);
+            let mut moved = Move::default();
+            for _ in 0..STEPS {
+                self.advance(refined, &parts, pass.sd_px, &mut moved);
+            }
             refined.sites = sites;
             refined.apply(&moved);
         }
     }
 
-    /// Moves on from where it has `moved` on the same sites, in the order of [`by_part`]: three steps,
-    /// in which the assignments settle while the geometry is linear. Covariance and offsets are kept
-    /// in `refined`, whose pose stays.
-    pub(super) fn glide(
+    /// One step on from where it has `moved`, on sites in the order of [`by_part`]. The parts' offsets
+    /// are kept in `refined`, whose pose stays. Without information nothing moves.
+    pub(super) fn advance(
         &self,
         refined: &mut Refined,
         sites: &[&Site],
         sd_px: f64,
         moved: &mut Move,
     ) {
-        for _ in 0..3 {
-            let Some(step) = self.step(refined, sites, sd_px, moved, 1.0) else { break };
-            moved.shared += step.shared;
-            moved.own.iter_mut().zip(step.own).for_each(|(m, s)| *m += s);
+        if let Some(found) = self.solve(refined, sites, sd_px, moved, 1.0) {
+            moved.shared += found.step.shared;
+            moved.own.iter_mut().zip(found.step.own).for_each(|(m, s)| *m += s);
+            refined.offsets = found.offsets;
         }
     }
 
@@ -150,8 +155,11 @@ impl Search<'_> {
     pub fn doubt(&self, refined: &mut Refined, pass: &Pass) {
         self.lay_out(refined, pass);
         let sites = std::mem::take(&mut refined.sites);
-        let still = Move::none(self.sights.len());
-        self.step(refined, &by_part(&sites), pass.sd_px, &still, DOUBT);
+        let still = Move::default();
+        let solution = self.solve(refined, &by_part(&sites), pass.sd_px, &still, DOUBT);
+        if let Some(solution) = solution {
+            refined.covariance = solution.covariance();
+        }
         refined.sites = sites;
     }
 
@@ -169,16 +177,15 @@ impl Search<'_> {
         refined.sites = found;
     }
 
-    /// One Gauss-Newton step from `moved` on sites in the order of [`by_part`]; keeps the covariance
-    /// in `refined`.
-    fn step(
+    /// One Gauss-Newton step from `moved` on sites in the order of [`by_part`].
+    fn solve(
         &self,
-        refined: &mut Refined,
+        refined: &Refined,
         sites: &[&Site],
         sd_px: f64,
         moved: &Move,
         doubt: f64,
-    ) -> Option<Move> {
+    ) -> Option<Solution> {
         let mut equations = Equations::new(self.sights.len(), sd_px, doubt);
         let mut edges = Vec::new();
         for part in sites.chunk_by(|a, b| part_of(a) == part_of(b)) {
@@ -207,10 +214,7 @@ impl Search<'_> {
             }
             equations.own(view, self.turn_precision(view), &-now.turns[view]);
         }
-        let solution = equations.solve()?;
-        refined.covariance = solution.covariance;
-        refined.offsets = solution.offsets;
-        Some(solution.step)
+        equations.solve()
     }
 
     fn turn_precision(&self, view: usize) -> f64 {
@@ -301,10 +305,10 @@ impl Search<'_> {
             None if self.query.up.is_some() && self.query.standing.is_none() => 2.0 * UNSUPPORTED,
             None => 0.0,
         };
-        let turns: f64 = (0..state.turns.len())
+        let turns: f64 = (0..self.sights.len())
             .map(|v| self.turn_precision(v) * state.turns[v].norm_squared())
             .sum();
-        let pixels: f64 = (0..state.turns.len())
+        let pixels: f64 = (0..self.sights.len())
             .filter_map(|v| self.landmark_pixel(state, v))
             .map(|(residual, ..)| (residual / LANDMARK_SD_PX).norm_squared())
             .sum();
@@ -332,12 +336,12 @@ impl Search<'_> {
 
 impl Refined {
     /// A pose not yet refined.
-    pub fn new(pose: &Transform, rests: bool, views: usize) -> Self {
+    pub fn new(pose: &Transform, rests: bool) -> Self {
         Refined {
             pose: *pose,
             rests,
             form: usual(),
-            turns: vec![Vector2::zeros(); views],
+            turns: Default::default(),
             covariance: Matrix6::identity(),
             offsets: Vec::new(),
             sites: Vec::new(),
@@ -352,7 +356,7 @@ impl Refined {
 
     /// The unknowns alone.
     pub(super) fn without_sites(&self) -> Self {
-        Refined { sites: Vec::new(), offsets: Vec::new(), turns: self.turns.clone(), ..*self }
+        Refined { sites: Vec::new(), offsets: Vec::new(), ..*self }
     }
 }
 

@@ -280,9 +280,13 @@ fn find_edges(site: &mut Site, level: &Level, range_px: f64, profile: &mut Vec<f
     let threshold = NOISE_FACTOR * level.step_noise;
     let mut strongest = 0.0f32;
     for i in 1..profile.len() - 1 {
+        let b = profile[i].abs();
+        if b < threshold {
+            continue;
+        }
         let sign = profile[i].signum();
-        let [a, b, c] = [profile[i - 1], profile[i], profile[i + 1]].map(|v| v * sign);
-        if b < threshold || b <= a || b < c {
+        let (a, c) = (profile[i - 1] * sign, profile[i + 1] * sign);
+        if b <= a || b < c {
             continue;
         }
         let [la, lc] = [a, c].map(|v| (v.max(LEAST_SHOULDER * b) / b).ln());
