@@ -1,6 +1,6 @@
 //! `vergence pose`: recognise the object in every scene of a pose set, write a BOP results CSV.
 
-mod set;
+pub mod set;
 mod table;
 
 use std::path::{Path, PathBuf};

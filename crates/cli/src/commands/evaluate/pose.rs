@@ -1,25 +1,29 @@
 //! `vergence evaluate pose`: how right, how honest and how fast the pose recogniser is on stereo
-//! pairs that the simulator draws, one a seed.
+//! pairs that the simulator draws, one a seed, or on a pose set with its truth.
 //!
-//! Nobody tells the recogniser whether the object stands; gravity is known. Every figure but those
-//! of honesty counts a refusal as wrong.
+//! In simulated scenes nobody tells the recogniser whether the object stands; gravity is known. Every
+//! figure but those of honesty counts a refusal as wrong.
 
 use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use clap::Args;
 use nalgebra::Vector3;
 use serde_json::json;
-use vergence_geometry::Symmetry;
+use vergence_geometry::{Symmetry, Transform};
 use vergence_pose::{ObjectPose, Query, Refusal, View};
-use vergence_sim::{Scenario, StereoScene, stereo_scene};
+use vergence_sim::{Scenario, stereo_scene};
 
-use crate::commands::pose::{Method, pool};
+use crate::commands::pose::{Method, pool, set};
 use crate::failure::Failure;
 
-/// Recognise objects in simulated stereo pairs and compare with the truth.
+/// Recognise objects in simulated stereo pairs, or in a pose set, and compare with the truth.
 #[derive(Args)]
 pub struct Pose {
+    /// Folder of a pose set with its truth (scene_gt_left.json), instead of simulated scenes.
+    #[arg(long, conflicts_with_all = ["scenes", "seed"])]
+    set: Option<PathBuf>,
     /// Scenes to draw.
     #[arg(long, default_value_t = 300)]
     scenes: u64,
@@ -46,7 +50,8 @@ enum Outcome {
 
 /// An answer against the truth.
 struct Answer {
-    seed: u64,
+    /// Seed, or number in the set.
+    scene: u64,
     position_mm: f64,
     rotation_deg: f64,
     /// Normalised squared error over its degrees of freedom; whether the 95 % ellipsoid holds the
@@ -60,11 +65,20 @@ pub fn run(args: &Pose) -> Result<bool, Failure> {
         let what = format!("--scenes {} is not between 1 and 100000", args.scenes);
         return Err(Failure::misuse(what, "give a number in that range"));
     }
-    let seeds = args.seed..args.seed.saturating_add(args.scenes);
-    let outcomes: Result<Vec<(Outcome, f64)>, Failure> = pool(args.threads)?.install(|| {
-        use rayon::prelude::*;
-        seeds.into_par_iter().map(|seed| recognise(seed, args.method)).collect()
-    });
+    let pool = pool(args.threads)?;
+    let outcomes: Result<Vec<(Outcome, f64)>, Failure> = if let Some(set) = &args.set {
+        let folders = set::scenes(set)?;
+        pool.install(|| {
+            use rayon::prelude::*;
+            folders.par_iter().map(|(id, folder)| photographed(*id, folder, args.method)).collect()
+        })
+    } else {
+        let seeds = args.seed..args.seed.saturating_add(args.scenes);
+        pool.install(|| {
+            use rayon::prelude::*;
+            seeds.into_par_iter().map(|seed| simulated(seed, args.method)).collect()
+        })
+    };
     let figures = Figures::of(&outcomes?);
     if args.json {
         println!("{}", figures.document(args));
@@ -74,8 +88,15 @@ pub fn run(args: &Pose) -> Result<bool, Failure> {
     Ok(figures.answered > 0)
 }
 
-/// One scene, with the seconds that its recognition took.
-fn recognise(seed: u64, method: Method) -> Result<(Outcome, f64), Failure> {
+/// One scene of a set, with the seconds that its recognition took.
+fn photographed(id: u32, folder: &Path, method: Method) -> Result<(Outcome, f64), Failure> {
+    let scene = set::Scene::read(folder)?;
+    let truth = scene.truth(folder)?;
+    Ok(recognise(id.into(), &scene.views(), &scene.query(), &truth, method))
+}
+
+/// The same of a simulated one.
+fn simulated(seed: u64, method: Method) -> Result<(Outcome, f64), Failure> {
     let scene = stereo_scene(Scenario::Default, seed)
         .map_err(|e| Failure::failed(e, "take another --seed"))?;
     let views = [0, 1].map(|k| View {
@@ -91,23 +112,33 @@ fn recognise(seed: u64, method: Method) -> Result<(Outcome, f64), Failure> {
         up: Some(Vector3::z_axis()),
         standing: None,
     };
+    Ok(recognise(seed, &views, &query, &scene.base_from_object, method))
+}
+
+fn recognise(
+    scene: u64,
+    views: &[View],
+    query: &Query,
+    truth: &Transform,
+    method: Method,
+) -> (Outcome, f64) {
     let start = Instant::now();
-    let result = method.recognise(&views, &query);
+    let result = method.recognise(views, query);
     let seconds = start.elapsed().as_secs_f64();
     let outcome = match result {
-        Ok(found) => Outcome::Answer(Answer::new(seed, &found, &scene)),
+        Ok(found) => Outcome::Answer(Answer::new(scene, &found, truth)),
         Err(refusal) => Outcome::Refused(match refusal {
             Refusal::Ambiguous { .. } => "another pose explains the edges about as well",
             Refusal::TooFewEdges { .. } => "too little of the contour lies on edges",
             _ => "the scene could not be worked on",
         }),
     };
-    Ok((outcome, seconds))
+    (outcome, seconds)
 }
 
 impl Answer {
-    fn new(seed: u64, found: &ObjectPose, scene: &StereoScene) -> Self {
-        let (pose, truth) = (&found.pose.pose, &scene.base_from_object);
+    fn new(scene: u64, found: &ObjectPose, truth: &Transform) -> Self {
+        let pose = &found.pose.pose;
         // 95 % quantiles of chi-squared with six, five and three degrees of freedom.
         let limit = match found.symmetry {
             Symmetry::Finite(_) => 12.592,
@@ -115,7 +146,7 @@ impl Answer {
             Symmetry::Full => 7.815,
         };
         Answer {
-            seed,
+            scene,
             position_mm: 1e3 * (pose.translation.vector - truth.translation.vector).norm(),
             rotation_deg: found
                 .symmetry
@@ -140,7 +171,7 @@ struct Figures {
     within_2: f64,
     median_mm: f64,
     median_deg: f64,
-    /// Seeds of answers off by more than 10 mm or 5 degrees.
+    /// Seeds (or numbers in the set) of answers off by more than 10 mm or 5 degrees.
     wrong: Vec<u64>,
     /// Share of the answers whose ellipsoid holds the truth.
     held: f64,
@@ -173,7 +204,7 @@ impl Figures {
             within_2: share(&|a| a.within(2.0, 2.0), outcomes.len()),
             median_mm: of_all(|a| a.position_mm),
             median_deg: of_all(|a| a.rotation_deg),
-            wrong: answers.iter().filter(|a| !a.within(10.0, 5.0)).map(|a| a.seed).collect(),
+            wrong: answers.iter().filter(|a| !a.within(10.0, 5.0)).map(|a| a.scene).collect(),
             held: share(&|a| a.nees.is_some_and(|(_, held)| held), answers.len()),
             nees: median(answers.iter().filter_map(|a| a.nees).map(|(n, _)| n)),
             refused,
@@ -182,15 +213,16 @@ impl Figures {
     }
 
     fn document(&self, args: &Pose) -> serde_json::Value {
+        let wrong = if args.set.is_some() { "wrong_scenes" } else { "wrong_seeds" };
         json!({
             "scenes": self.scenes,
-            "seed": args.seed,
+            "seed": args.set.is_none().then_some(args.seed),
             "answered": self.answered,
             "within_5mm_5deg": self.within_5,
             "within_2mm_2deg": self.within_2,
             "median_position_mm": self.median_mm,
             "median_rotation_deg": self.median_deg,
-            "wrong_seeds": self.wrong,
+            wrong: self.wrong,
             "ellipsoid_95_coverage": self.held,
             "nees_over_freedoms_median": self.nees,
             "refused": self.refused,
@@ -199,7 +231,10 @@ impl Figures {
     }
 
     fn print(&self, args: &Pose) {
-        println!("{} simulated stereo scenes from seed {}", self.scenes, args.seed);
+        match &args.set {
+            Some(set) => println!("{} scenes of {}", self.scenes, set.display()),
+            None => println!("{} simulated stereo scenes from seed {}", self.scenes, args.seed),
+        }
         println!("answered                          {}", self.answered);
         println!("within 5 mm, 5 deg (of all)       {:.3}", self.within_5);
         println!("within 2 mm, 2 deg (of all)       {:.3}", self.within_2);
@@ -210,7 +245,7 @@ impl Figures {
         println!(
             "answers beyond 10 mm or 5 deg     {} {}",
             self.wrong.len(),
-            if self.wrong.is_empty() { String::new() } else { format!("(seeds {:?})", self.wrong) }
+            if self.wrong.is_empty() { String::new() } else { format!("{:?}", self.wrong) }
         );
         println!("95 % ellipsoid holds the truth    {:.3} of the answers", self.held);
         println!("squared error over its freedoms   {:.2} median", self.nees);

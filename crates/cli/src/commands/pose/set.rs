@@ -1,7 +1,8 @@
 //! A pose set on disk: BOP multi-sensor layout with two grey cameras and the tags' records.
 //!
 //! Read are `scene_camera_*.json`, `scene_tags.json` and the pictures; the truth
-//! (`scene_gt_*.json`, `scene_info.json`) never is. Lengths on disk are millimetres, here metres.
+//! (`scene_gt_left.json`) only where answers are compared with it. Lengths on disk are millimetres,
+//! here metres.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -62,6 +63,13 @@ struct TagEntry {
     standing: Option<bool>,
 }
 
+#[derive(Deserialize)]
+#[allow(non_snake_case)]
+struct TruthEntry {
+    cam_R_m2c: [f64; 9],
+    cam_t_m2c: [f64; 3],
+}
+
 /// Scene folders of a set with their numbers, in order.
 pub fn scenes(set: &Path) -> Result<Vec<(u32, PathBuf)>, Failure> {
     let test = set.join("test");
@@ -103,6 +111,16 @@ impl Scene {
             standing: tag.standing,
             gravity_known: gravity_known || tag.standing.is_some(),
         })
+    }
+
+    /// `base_from_object` in truth, of the first object in the left picture.
+    pub fn truth(&self, folder: &Path) -> Result<Transform, Failure> {
+        let path = folder.join("scene_gt_left.json");
+        let (_, objects): (String, Vec<TruthEntry>) = first(&path)?;
+        let object = objects.first().ok_or_else(|| bad(&path, "names no object"))?;
+        let left_from_object = rigid(&object.cam_R_m2c, &object.cam_t_m2c)
+            .ok_or_else(|| bad(&path, "cam_R_m2c is not a rotation, or cam_t_m2c not finite"))?;
+        Ok(self.pictures[0].base_from_optical * left_from_object)
     }
 
     /// The pictures as the recogniser wants them, left first.
@@ -153,7 +171,7 @@ impl Picture {
             distortion: Distortion { k1, k2, p1, p2, k3 },
         };
         camera.validate().map_err(|e| bad(&path, e))?;
-        let base_from_optical = optical_from_base(&entry)
+        let base_from_optical = rigid(&entry.cam_R_w2c, &entry.cam_t_w2c)
             .ok_or_else(|| bad(&path, "cam_R_w2c is not a rotation, or cam_t_w2c not finite"))?;
         let base_from_optical = base_from_optical.inverse();
         let turn_sd = entry.turn_sd.abs();
@@ -161,9 +179,10 @@ impl Picture {
     }
 }
 
-fn optical_from_base(entry: &CameraEntry) -> Option<Transform> {
-    let r = Matrix3::from_row_slice(&entry.cam_R_w2c);
-    let t = Vector3::from(entry.cam_t_w2c) * MM;
+/// A pose of BOP: a rotation by rows and millimetres.
+fn rigid(rotation: &[f64; 9], translation_mm: &[f64; 3]) -> Option<Transform> {
+    let r = Matrix3::from_row_slice(rotation);
+    let t = Vector3::from(*translation_mm) * MM;
     let sound = (r * r.transpose() - Matrix3::identity()).norm() < 1e-3 && r.determinant() > 0.0;
     let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(r));
     (sound && t.iter().all(|v| v.is_finite())).then(|| Transform::from_parts(t.into(), rotation))
