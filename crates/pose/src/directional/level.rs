@@ -175,6 +175,13 @@ impl Level {
 fn reduce(image: &Image<u8>, region: &Region, scale: usize) -> Image<f32> {
     let (width, height) = ((region.width / scale).max(1), (region.height / scale).max(1));
     let mut out = Image::filled(width, height, 0.0f32);
+    if scale == 1 {
+        for y in 0..height {
+            let row = &image.row(region.top + y)[region.left..][..width];
+            out.row_mut(y).iter_mut().zip(row).for_each(|(o, &v)| *o = f32::from(v));
+        }
+        return out;
+    }
     let mut sums = vec![0u32; width];
     let weight = 1.0 / (scale * scale) as f32;
     for y in 0..height {
