@@ -185,8 +185,8 @@ pub fn track(
     Ok(found)
 }
 
-/// Room for what the object's place and size may be off by (m), and for profiles across its contour
-/// (px).
+/// Room for what the object's size and attitude may be off by (m), and for profiles across its
+/// contour (px).
 const SLACK: f64 = 0.01;
 const MARGIN_PX: f64 = 8.0;
 
@@ -196,10 +196,11 @@ fn around(query: &Query, landmark: Vector3<f64>, half: Vector3<f64>) -> Vec<Poin
     let (Some(up), Some(true)) = (query.up, query.standing) else { return Vec::new() };
     const RING: usize = 16;
     // A polygon of so many corners holds the circle when it is that much larger.
-    let radius = ((landmark.abs() + half).xy().norm() + SLACK) / (PI / RING as f64).cos();
+    let slack = SLACK + 2.0 * query.landmark.covariance.trace().sqrt();
+    let radius = ((landmark.abs() + half).xy().norm() + slack) / (PI / RING as f64).cos();
     let level = UnitQuaternion::rotation_between_axis(&Vector3::z_axis(), &up)
         .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&Vector3::x_axis(), PI));
-    let heights = [-half.z - SLACK, half.z + SLACK].map(|z| z - landmark.z);
+    let heights = [-half.z - slack, half.z + slack].map(|z| z - landmark.z);
     let ring = |z: f64| {
         (0..RING).map(move |k| {
             let (sin, cos) = (k as f64 * 2.0 * PI / RING as f64).sin_cos();
@@ -235,17 +236,13 @@ fn prepare<'a>(
                 scale *= 2;
             }
             let (width, height) = (view.image.width(), view.image.height());
-            let corner = |side: f64| (pixel.x + side * reach_px, pixel.y + side * reach_px);
             let seen = |p: &Point3<f64>| view.camera.project(&(optical_from_base * p));
-            let around: Option<Vec<_>> = around.iter().map(seen).collect();
-            let corners = around.filter(|a| !a.is_empty()).map_or_else(
-                || vec![corner(-1.0), corner(1.0)],
-                |a| {
-                    let beside = |m: f64| a.iter().map(move |p| (p.x + m, p.y + m));
-                    beside(-MARGIN_PX).chain(beside(MARGIN_PX)).collect()
-                },
-            );
-            let region = Region::of(&corners, width, height)?;
+            let ring: Option<Vec<_>> = around.iter().map(seen).collect();
+            let (places, beside) = match ring.filter(|r| !r.is_empty()) {
+                Some(ring) => (ring, MARGIN_PX),
+                None => (vec![pixel], reach_px),
+            };
+            let region = Region::around(&places, beside, width, height)?;
             let full = Reduced::new(view.image, &region, 1);
             let fine = full.smoothed(PLACE_BLUR_PX);
             let reduced = if scale > 1 { Reduced::new(view.image, &region, scale) } else { full };

@@ -5,7 +5,7 @@
 //! two look-ups. The idea is that of fast directional chamfer matching (Liu et al., CVPR 2010):
 //! distance in place plus a price for the angle, summed by integral images along the direction.
 //! Here the distance is measured across the line only (that is what an edge point says), in a layout
-//! where lines run down the rows, so every pass is a loop over row slices.
+//! where lines run down the rows: an edge point changes its own row only.
 //!
 //! Values are sixteenths of a level pixel in u16; sums wrap around, differences stay exact as long
 //! as one segment's sum stays below 65536, that is for segments up to 600 pixels.

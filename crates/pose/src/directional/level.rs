@@ -7,6 +7,7 @@
 //! on the camera's resolution.
 
 use multiversion::multiversion;
+use nalgebra::Point2;
 use vergence_imaging::{Image, kernel};
 
 /// A gradient's noise is never taken to be lower (grey levels per pixel): quantisation.
@@ -29,16 +30,22 @@ pub struct Region {
 }
 
 impl Region {
-    /// The part of a picture that holds some points; `None` when there is none.
-    pub fn of(points: &[(f64, f64)], width: usize, height: usize) -> Option<Self> {
-        let range = |at: fn(&(f64, f64)) -> f64, size: usize| {
+    /// The part of a picture within `beside` pixels of some places; `None` when there is none.
+    pub fn around(
+        places: &[Point2<f64>],
+        beside: f64,
+        width: usize,
+        height: usize,
+    ) -> Option<Self> {
+        let range = |axis: usize, size: usize| {
+            let along = places.iter().map(|p| p[axis]);
+            let low = along.clone().fold(f64::INFINITY, f64::min) - beside;
+            let high = along.fold(f64::NEG_INFINITY, f64::max) + beside;
             let inside = |c: f64| c.clamp(0.0, size as f64) as usize;
-            let low = points.iter().map(at).fold(f64::INFINITY, f64::min);
-            let high = points.iter().map(at).fold(f64::NEG_INFINITY, f64::max);
             let (low, high) = (inside(low.floor()), inside(high.ceil()));
             (high > low + 7).then_some((low, high - low))
         };
-        let ((left, width), (top, height)) = (range(|p| p.0, width)?, range(|p| p.1, height)?);
+        let ((left, width), (top, height)) = (range(0, width)?, range(1, height)?);
         Some(Region { left, top, width, height })
     }
 }
