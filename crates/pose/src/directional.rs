@@ -388,3 +388,51 @@ impl Search<'_> {
         Ok(found)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::{Matrix3, Unit};
+    use vergence_geometry::GaussianPoint;
+    use vergence_tag::Record;
+
+    #[test]
+    fn the_rings_hold_every_corner_of_a_standing_object() {
+        let text = r#"{"object_id": "box", "landmarks": [{"position": [0.05, -0.03, 0.01], "normal": [1, 0, 0]}],
+            "bounding_box": {"width": 0.10, "length": 0.16, "height": 0.07}, "shape": {"kind": "box"}}"#;
+        let record: Record = serde_json::from_str(text).unwrap();
+        let (landmark, half) = (Vector3::new(0.05, -0.03, 0.01), Vector3::new(0.05, 0.08, 0.035));
+        for up in [Vector3::z(), -Vector3::z(), Vector3::new(0.3, -0.2, 0.9)] {
+            let up = Unit::new_normalize(up);
+            let position = Point3::new(0.6, 0.1, 0.2);
+            let covariance = Matrix3::identity() * 1e-6;
+            let mut query = Query {
+                record: &record,
+                landmark: GaussianPoint { position, covariance },
+                landmark_index: 0,
+                up: Some(up),
+                standing: Some(true),
+            };
+            let rings = around(&query, landmark, half);
+            let (below, above) = rings.split_at(rings.len() / 2);
+            let height = |p: &Point3<f64>| (p - position).dot(&up);
+            for turn in crate::rotations::standing(up, -Vector3::z_axis(), 40) {
+                for k in 0..8 {
+                    let side = |bit: i32| if k & bit == 0 { -1.0 } else { 1.0 };
+                    let corner = half.component_mul(&Vector3::new(side(1), side(2), side(4)));
+                    let corner = position + turn * (corner - landmark);
+                    assert!(height(&corner) > height(&below[0]));
+                    assert!(height(&corner) < height(&above[0]));
+                    // Inside of the polygon: on the inner side of each of its edges.
+                    for (a, b) in above.iter().zip(above.iter().cycle().skip(1)) {
+                        let outwards = (b - a).cross(&up);
+                        let out = |p: &Point3<f64>| outwards.dot(&(p - a));
+                        assert!(out(&corner) * out(&position) > 0.0, "{corner} by {up:?}");
+                    }
+                }
+            }
+            query.standing = None;
+            assert!(around(&query, landmark, half).is_empty());
+        }
+    }
+}
