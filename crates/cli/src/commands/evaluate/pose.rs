@@ -256,9 +256,10 @@ impl Figures {
     }
 }
 
-/// The upper median; not a number when there is none.
+/// The median, between the middle two of an even number; not a number when there is none.
 fn median(values: impl Iterator<Item = f64>) -> f64 {
     let mut values: Vec<f64> = values.collect();
     values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or(f64::NAN)
+    let at = |k: usize| values.get(k).copied().unwrap_or(f64::NAN);
+    0.5 * (at(values.len().saturating_sub(1) / 2) + at(values.len() / 2))
 }
