@@ -19,7 +19,7 @@ pub mod verdict;
 
 use std::f64::consts::PI;
 
-use nalgebra::{Point3, UnitQuaternion, Vector3};
+use nalgebra::{Point2, Point3, UnitQuaternion, Vector2, Vector3};
 use vergence_geometry::{GaussianPose, Transform};
 
 use crate::model::Model;
@@ -210,6 +210,28 @@ fn around(query: &Query, landmark: Vector3<f64>, half: Vector3<f64>) -> Vec<Poin
     heights.into_iter().flat_map(ring).collect()
 }
 
+/// The part of a view that holds some points (base), but nothing further from the landmark's pixel than
+/// the object reaches, however uncertain their place is. Without points, or when one is behind the
+/// camera, all that the object reaches.
+fn region(
+    view: &View,
+    around: &[Point3<f64>],
+    pixel: &Point2<f64>,
+    reach_px: f64,
+) -> Option<Region> {
+    let reach = Vector2::repeat(reach_px);
+    let seen = |p: &Point3<f64>| {
+        let place = view.camera.project(&view.base_from_optical.inverse_transform_point(p))?;
+        Some((pixel - reach).sup(&(pixel + reach).inf(&place)))
+    };
+    let places: Option<Vec<_>> = around.iter().map(seen).collect();
+    let (width, height) = (view.image.width(), view.image.height());
+    match places.filter(|p| !p.is_empty()) {
+        Some(places) => Region::around(&places, MARGIN_PX, width, height),
+        None => Region::around(&[*pixel], reach_px, width, height),
+    }
+}
+
 /// Levels of the views that can show the object; edges and fields when there is to be a search.
 fn prepare<'a>(
     views: &[View<'a>],
@@ -235,14 +257,7 @@ fn prepare<'a>(
             while reach_px / scale as f64 > config.reach_px {
                 scale *= 2;
             }
-            let (width, height) = (view.image.width(), view.image.height());
-            let seen = |p: &Point3<f64>| view.camera.project(&(optical_from_base * p));
-            let ring: Option<Vec<_>> = around.iter().map(seen).collect();
-            let (places, beside) = match ring.filter(|r| !r.is_empty()) {
-                Some(ring) => (ring, MARGIN_PX),
-                None => (vec![pixel], reach_px),
-            };
-            let region = Region::around(&places, beside, width, height)?;
+            let region = region(view, &around, &pixel, reach_px)?;
             let full = Reduced::new(view.image, &region, 1);
             let fine = full.smoothed(PLACE_BLUR_PX);
             let reduced = if scale > 1 { Reduced::new(view.image, &region, scale) } else { full };
