@@ -19,10 +19,11 @@ pub mod verdict;
 
 use std::f64::consts::PI;
 
-use nalgebra::{Point2, Point3, UnitQuaternion, Vector2, Vector3};
+use nalgebra::{Point2, Point3, Vector2, Vector3};
 use vergence_geometry::{GaussianPose, Transform};
 
 use crate::model::Model;
+use crate::rotations;
 use crate::types::{Alternative, ObjectPose, Query, Refusal, View, check};
 use field::Field;
 use level::{Reduced, Region};
@@ -198,14 +199,10 @@ fn around(query: &Query, landmark: Vector3<f64>, half: Vector3<f64>) -> Vec<Poin
     // A polygon of so many corners holds the circle when it is that much larger.
     let slack = SLACK + 2.0 * query.landmark.covariance.trace().sqrt();
     let radius = ((landmark.abs() + half).xy().norm() + slack) / (PI / RING as f64).cos();
-    let level = UnitQuaternion::rotation_between_axis(&Vector3::z_axis(), &up)
-        .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&Vector3::x_axis(), PI));
     let heights = [-half.z - slack, half.z + slack].map(|z| z - landmark.z);
     let ring = |z: f64| {
-        (0..RING).map(move |k| {
-            let (sin, cos) = (k as f64 * 2.0 * PI / RING as f64).sin_cos();
-            query.landmark.position + level * Vector3::new(radius * cos, radius * sin, z)
-        })
+        rotations::standing(up, -Vector3::z_axis(), RING)
+            .map(move |turn| query.landmark.position + turn * Vector3::new(radius, 0.0, z))
     };
     heights.into_iter().flat_map(ring).collect()
 }
@@ -431,7 +428,7 @@ mod tests {
             let rings = around(&query, landmark, half);
             let (below, above) = rings.split_at(rings.len() / 2);
             let height = |p: &Point3<f64>| (p - position).dot(&up);
-            for turn in crate::rotations::standing(up, -Vector3::z_axis(), 40) {
+            for turn in rotations::standing(up, -Vector3::z_axis(), 40) {
                 for k in 0..8 {
                     let side = |bit: i32| if k & bit == 0 { -1.0 } else { 1.0 };
                     let corner = half.component_mul(&Vector3::new(side(1), side(2), side(4)));

@@ -7,7 +7,6 @@
 use std::f32::consts::{FRAC_PI_2, FRAC_PI_4, PI};
 
 use multiversion::multiversion;
-use vergence_imaging::Image;
 
 use super::level::Level;
 
@@ -28,15 +27,17 @@ pub struct Edgel {
 /// The edge points of a level.
 pub fn edgels(level: &Level) -> Vec<Edgel> {
     let (width, height) = (level.width(), level.height());
+    if width < 3 || height < 3 {
+        return Vec::new();
+    }
     let threshold2 = (NOISE_FACTOR * level.slope_noise).powi(2);
     let (gx, gy) = level.slopes();
-    let mut magnitude = Image::filled(width, height, 0.0f32);
     let squares = gx.data().iter().zip(gy.data()).map(|(gx, gy)| gx * gx + gy * gy);
-    magnitude.data_mut().iter_mut().zip(squares).for_each(|(m, square)| *m = square);
+    let magnitude: Vec<f32> = squares.collect();
     let mut out = Vec::new();
-    let mut on_ridge = vec![0; width.saturating_sub(2)];
-    for y in 1..height.saturating_sub(1) {
-        let around = [y - 1, y, y + 1].map(|y| magnitude.row(y));
+    let mut on_ridge = vec![0; width - 2];
+    for y in 1..height - 1 {
+        let around = [y - 1, y, y + 1].map(|y| &magnitude[y * width..][..width]);
         ridges(around, gx.row(y), gy.row(y), threshold2, &mut on_ridge);
         let found = (1..).zip(&on_ridge).filter(|(_, on)| **on != 0);
         out.extend(found.map(|(x, _)| Edgel {
@@ -91,4 +92,37 @@ pub fn line_direction(dx: f32, dy: f32) -> f32 {
     }
     let direction = if dx == 0.0 { 0.0 } else { atan(dy / dx) };
     if direction < 0.0 { direction + PI } else { direction }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::directional::level::{Reduced, Region};
+    use vergence_imaging::Image;
+
+    fn level(width: usize, height: usize, scale: usize) -> Level {
+        // Dark on the left, bright on the right of the middle.
+        let image = Image::from_fn(width, height, |x, _| if x < width / 2 { 40u8 } else { 160 });
+        let whole = Region { left: 0, top: 0, width, height };
+        Reduced::new(&image, &whole, scale).smoothed(0.7)
+    }
+
+    #[test]
+    fn an_upright_step_has_one_upright_edge_point_a_row() {
+        let found = edgels(&level(16, 10, 1));
+        assert_eq!(found.len(), 8, "{found:?}");
+        for (e, y) in found.iter().zip(1..) {
+            assert_eq!(e.y, y);
+            assert!((7..=8).contains(&e.x), "{e:?}");
+            assert!((e.direction - FRAC_PI_2).abs() < 0.01, "{e:?}");
+        }
+    }
+
+    #[test]
+    fn a_level_too_narrow_for_slopes_has_none() {
+        // The object is large and all but outside of the picture.
+        for (width, height) in [(8, 64), (64, 8), (16, 64), (8, 8)] {
+            assert_eq!(edgels(&level(width, height, 8)), []);
+        }
+    }
 }

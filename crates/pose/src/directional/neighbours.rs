@@ -173,8 +173,9 @@ impl Search<'_> {
         let explained = optima[0].1;
         let behind = |e: &Explained| explained.evidence - e.evidence;
         optima.retain(|o| behind(&o.1) < MOST_BEHIND * DOUBT_NATS);
-        let count = optima.iter_mut().filter(|o| behind(&o.1) < POLISHED);
-        count.for_each(|o| self.refine(&mut o.0, &[POLISH]));
+        for (refined, _) in optima.iter_mut().filter(|o| behind(&o.1) < POLISHED) {
+            self.refine(refined, &[POLISH]);
+        }
         let place = optima[0].0.pose;
         let (mut mean, mut beliefs) = (Vector6::zeros(), 0.0);
         for (refined, explained) in &mut optima {

@@ -105,7 +105,7 @@ pub struct Refined {
     pub form: Form,
     /// Small turns of each view's camera about its own x and y axes (rad).
     pub turns: [Vector2<f64>; VIEWS],
-    /// Covariance of the pose's tangent as the information has it.
+    /// Covariance of the pose's tangent, once [`Search::doubt`] has put it there.
     pub covariance: Matrix6<f64>,
     /// How far off the parts of the object seem to be from where the record has them.
     pub offsets: Vec<Offsets>,

@@ -65,20 +65,17 @@ pub fn run(args: &Pose) -> Result<bool, Failure> {
         let what = format!("--scenes {} is not between 1 and 100000", args.scenes);
         return Err(Failure::misuse(what, "give a number in that range"));
     }
-    let pool = pool(args.threads)?;
-    let outcomes: Result<Vec<(Outcome, f64)>, Failure> = if let Some(set) = &args.set {
-        let folders = set::scenes(set)?;
-        pool.install(|| {
-            use rayon::prelude::*;
-            folders.par_iter().map(|(id, folder)| photographed(*id, folder, args.method)).collect()
-        })
-    } else {
+    let folders = args.set.as_deref().map(set::scenes).transpose()?;
+    let outcomes: Result<Vec<(Outcome, f64)>, Failure> = pool(args.threads)?.install(|| {
+        use rayon::prelude::*;
         let seeds = args.seed..args.seed.saturating_add(args.scenes);
-        pool.install(|| {
-            use rayon::prelude::*;
-            seeds.into_par_iter().map(|seed| simulated(seed, args.method)).collect()
-        })
-    };
+        match folders {
+            Some(folders) => {
+                folders.par_iter().map(|(id, folder)| recorded(*id, folder, args.method)).collect()
+            }
+            None => seeds.into_par_iter().map(|seed| simulated(seed, args.method)).collect(),
+        }
+    });
     let figures = Figures::of(&outcomes?);
     if args.json {
         println!("{}", figures.document(args));
@@ -89,7 +86,7 @@ pub fn run(args: &Pose) -> Result<bool, Failure> {
 }
 
 /// One scene of a set, with the seconds that its recognition took.
-fn photographed(id: u32, folder: &Path, method: Method) -> Result<(Outcome, f64), Failure> {
+fn recorded(id: u32, folder: &Path, method: Method) -> Result<(Outcome, f64), Failure> {
     let scene = set::Scene::read(folder)?;
     let truth = scene.truth(folder)?;
     Ok(recognise(id.into(), &scene.views(), &scene.query(), &truth, method))
