@@ -2,7 +2,7 @@
 
 use std::f64::consts::TAU;
 
-use nalgebra::Vector3;
+use nalgebra::{Vector2, Vector3};
 
 use super::{Kind, Line, Outline};
 
@@ -33,20 +33,27 @@ impl Frustum {
         let across = eye.x.hypot(eye.y);
         let towards = eye.y.atan2(eye.x);
         // Half the azimuth range of the wall that faces the eye.
-        let half = (reach / across.max(1e-12)).clamp(-1.0, 1.0).acos();
+        let cos_half = (reach / across.max(1e-12)).clamp(-1.0, 1.0);
+        let half = cos_half.acos();
+        // Where that range begins and ends. Rotations are made from what is known: the search asks
+        // for thousands of outlines, and sines would take much of its time.
+        let facing = match across > 0.0 {
+            true => Vector2::new(eye.x, eye.y) / across,
+            false => Vector2::x(),
+        };
+        let to_side = Vector2::new(cos_half, (1.0 - cos_half * cos_half).sqrt());
+        let begin = turned(&facing, &Vector2::new(to_side.x, -to_side.y));
+        let end = turned(&facing, &to_side);
+        let near = Arc { start: towards - half, from: begin, length: 2.0 * half };
+        let far = Arc { start: towards + half, from: end, length: TAU - 2.0 * half };
         let (top_seen, bottom_seen) = (eye.z > self.half_height, eye.z < -self.half_height);
-        self.rim(self.top, self.half_height, top_seen, towards, half, chords, out);
-        self.rim(self.bottom, -self.half_height, bottom_seen, towards, half, chords, out);
+        self.rim(self.top, self.half_height, top_seen, [near, far], chords, out);
+        self.rim(self.bottom, -self.half_height, bottom_seen, [near, far], chords, out);
         if half > 0.0 && half < TAU / 2.0 {
-            for (side, t) in [towards - half, towards + half].into_iter().enumerate() {
-                let (sin, cos) = t.sin_cos();
+            for (side, direction) in [begin, end].into_iter().enumerate() {
                 let first = out.points.len() as u16;
-                out.points.push(Vector3::new(self.top * cos, self.top * sin, self.half_height));
-                out.points.push(Vector3::new(
-                    self.bottom * cos,
-                    self.bottom * sin,
-                    -self.half_height,
-                ));
+                out.points.push((self.top * direction).push(self.half_height));
+                out.points.push((self.bottom * direction).push(-self.half_height));
                 let ends = [first, first + 1];
                 let part = side as u16;
                 out.lines.push(Line { ends, kind: Kind::Silhouette, away: None, part, along: 0.0 });
@@ -61,21 +68,20 @@ impl Frustum {
         radius: f64,
         z: f64,
         cap: bool,
-        towards: f64,
-        half: f64,
+        [near, far]: [Arc; 2],
         chords: usize,
         out: &mut Outline,
     ) {
         let outward = Vector3::new(0.0, 0.0, z.signum());
         let open = self.open && z > 0.0;
-        let near = match cap {
+        let kind = match cap {
             true => (if open { Kind::Rim } else { Kind::Crease }, None),
             false => (Kind::Silhouette, Some(outward)),
         };
-        arc(radius, z, towards - half, 2.0 * half, near, chords, out);
+        near.chords(radius, z, kind, chords, out);
         if cap {
-            let far = (if open { Kind::Rim } else { Kind::Silhouette }, None);
-            arc(radius, z, towards + half, TAU - 2.0 * half, far, chords, out);
+            let kind = (if open { Kind::Rim } else { Kind::Silhouette }, None);
+            far.chords(radius, z, kind, chords, out);
         }
     }
 }
@@ -84,32 +90,53 @@ impl Frustum {
 const TOP: u16 = 2;
 const BOTTOM: u16 = 3;
 
-fn arc(
-    radius: f64,
-    z: f64,
+/// A range of azimuths.
+#[derive(Clone, Copy)]
+struct Arc {
+    /// Where it begins (rad), and the unit vector there.
     start: f64,
+    from: Vector2<f64>,
+    /// How far it goes on (rad).
     length: f64,
-    (kind, away): (Kind, Option<Vector3<f64>>),
-    chords: usize,
-    out: &mut Outline,
-) {
-    let n = (length / TAU * chords as f64).ceil() as usize;
-    if n == 0 || length < 1e-9 {
-        return;
+}
+
+impl Arc {
+    /// Writes a rim's chords over this range.
+    fn chords(
+        &self,
+        radius: f64,
+        z: f64,
+        (kind, away): (Kind, Option<Vector3<f64>>),
+        of_circle: usize,
+        out: &mut Outline,
+    ) {
+        let n = (self.length / TAU * of_circle as f64).ceil() as usize;
+        if n == 0 || self.length < 1e-9 {
+            return;
+        }
+        let chord = self.length / n as f64;
+        let (sin, cos) = chord.sin_cos();
+        let step = Vector2::new(cos, sin);
+        // Chords of the circle that is as far outside at the corners as inside at the middles.
+        let middle = (0.5 * (1.0 + cos)).sqrt();
+        let part = if z > 0.0 { TOP } else { BOTTOM };
+        let mut p = self.from * (radius * 2.0 / (1.0 + middle));
+        let start = self.start.rem_euclid(TAU);
+        for k in 0..n {
+            let first = out.points.len() as u16;
+            out.points.push(p.push(z));
+            let azimuth = start + chord * k as f64;
+            let along = radius * if azimuth < TAU { azimuth } else { azimuth - TAU };
+            out.lines.push(Line { ends: [first, first + 1], kind, away, part, along });
+            p = turned(&p, &step);
+        }
+        out.points.push(p.push(z));
     }
-    let (sin, cos) = (length / n as f64).sin_cos();
-    // Chords of the circle that is as far outside at the corners as inside at the middles.
-    let r = radius * 2.0 / (1.0 + (length / (2.0 * n as f64)).cos());
-    let part = if z > 0.0 { TOP } else { BOTTOM };
-    let mut p = Vector3::new(r * start.cos(), r * start.sin(), z);
-    for k in 0..n {
-        let first = out.points.len() as u16;
-        out.points.push(p);
-        let along = radius * (start + length * k as f64 / n as f64).rem_euclid(TAU);
-        out.lines.push(Line { ends: [first, first + 1], kind, away, part, along });
-        p = Vector3::new(p.x * cos - p.y * sin, p.x * sin + p.y * cos, z);
-    }
-    out.points.push(p);
+}
+
+/// A vector turned by the angle of a unit vector.
+fn turned(v: &Vector2<f64>, by: &Vector2<f64>) -> Vector2<f64> {
+    Vector2::new(v.x * by.x - v.y * by.y, v.x * by.y + v.y * by.x)
 }
 
 /// Writes the outline of a ball: the circle where the lines of sight touch it.
