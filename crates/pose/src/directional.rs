@@ -324,7 +324,7 @@ impl Search<'_> {
 
     /// What a refined pose explains, priors included.
     fn weigh(&self, mut refined: Refined, pass: &Pass) -> (Refined, Explained) {
-        self.lay_out(&mut refined, pass);
+        self.lay_out(&mut refined, &pass.layout);
         let mut explained = verdict::weigh(&refined.sites, pass.layout.range_px, pass.sd_px);
         explained.evidence -= self.strain(&refined);
         (refined, explained)

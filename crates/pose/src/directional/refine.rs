@@ -79,8 +79,6 @@ pub struct Pass {
     pub sd_px: f64,
     /// How sites are laid out.
     pub layout: Layout,
-    /// At full resolution instead of the working scale.
-    pub fine: bool,
 }
 
 /// Steps on the same sites: the assignments settle while the geometry is linear.
@@ -92,7 +90,7 @@ pub const FINAL: Pass = Pass::new(EDGE_SD_PX, 4.0, 2.5, true);
 impl Pass {
     /// A pass from its numbers: deviation, range to either side, spacing of sites (picture px).
     pub const fn new(sd_px: f64, range_px: f64, spacing_px: f64, fine: bool) -> Self {
-        Pass { sd_px, layout: Layout { spacing_px, range_px }, fine }
+        Pass { sd_px, layout: Layout { spacing_px, range_px, fine } }
     }
 }
 
@@ -123,7 +121,7 @@ impl Search<'_> {
     /// Refines a state through the given passes.
     pub fn refine(&self, refined: &mut Refined, passes: &[Pass]) {
         for pass in passes {
-            self.lay_out(refined, pass);
+            self.lay_out(refined, &pass.layout);
             let sites = std::mem::take(&mut refined.sites);
             let parts = by_part(&sites);
             let mut moved = Move::default();
@@ -153,7 +151,7 @@ impl Search<'_> {
 
     /// The covariance of a refined pose, with all that sites have in common taken seriously.
     pub fn doubt(&self, refined: &mut Refined, pass: &Pass) {
-        self.lay_out(refined, pass);
+        self.lay_out(refined, &pass.layout);
         let sites = std::mem::take(&mut refined.sites);
         let still = Move::default();
         let solution = self.solve(refined, &by_part(&sites), pass.sd_px, &still, DOUBT);
@@ -164,15 +162,14 @@ impl Search<'_> {
     }
 
     /// Looks for the edges around a refined pose anew.
-    pub fn lay_out(&self, refined: &mut Refined, pass: &Pass) {
+    pub fn lay_out(&self, refined: &mut Refined, layout: &Layout) {
         let mut found = std::mem::take(&mut refined.sites);
         found.clear();
         for (view, sight) in self.sights.iter().enumerate() {
-            let level = if pass.fine { &sight.fine } else { &sight.coarse };
             let state =
                 State { pose: &refined.pose, form: refined.form, turn: refined.turns[view] };
             let up = self.query.up;
-            sites(&mut found, sight, view, level, self.model, &state, up, &pass.layout);
+            sites(&mut found, sight, view, self.model, &state, up, layout);
         }
         refined.sites = found;
     }

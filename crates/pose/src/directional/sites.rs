@@ -135,6 +135,8 @@ pub struct Layout {
     pub spacing_px: f64,
     /// Edges are looked for this far to either side (picture px).
     pub range_px: f64,
+    /// At full resolution instead of the working scale.
+    pub fine: bool,
 }
 
 /// What the sites are laid out for.
@@ -153,12 +155,12 @@ pub fn sites(
     out: &mut Vec<Site>,
     sight: &Sight,
     view: usize,
-    level: &Level,
     model: &Model,
     state: &State,
     up: Option<Unit<Vector3<f64>>>,
     layout: &Layout,
 ) {
+    let level = if layout.fine { &sight.fine } else { &sight.coarse };
     let pose = state.pose;
     let size = state.form.x.exp();
     let turned = Transform::rotation(state.turn.push(0.0));
@@ -181,9 +183,6 @@ pub fn sites(
             [segment.from, segment.to].map(|p| optical_from_object * Point3::from(p * size));
         let (Some(a), Some(b)) = (camera.project(&from), camera.project(&to)) else { continue };
         let length = (b - a).norm();
-        if length < 0.3 {
-            continue;
-        }
         let here = Some((segment.part, segment.kind));
         if part != here {
             (part, since) = (here, 0.0);
