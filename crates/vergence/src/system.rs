@@ -7,7 +7,7 @@ use vergence_devices::{
     Config, Description, DescriptionError, DeviceError, JointReading, Robot, Side,
 };
 use vergence_geometry::Chain;
-use vergence_head::PanTiltHead;
+use vergence_head::{HeadError, PanTiltHead};
 use vergence_imaging::Frame;
 use vergence_tag::signature::TrustedKeys;
 
@@ -35,6 +35,14 @@ pub enum SystemError {
         side: &'static str,
         /// What is wrong.
         source: DescriptionError,
+    },
+    /// The URDF's joints or the configuration's lens cannot be those of a head.
+    #[error("{side} head: {source}: correct the joints' limits in the URDF")]
+    Head {
+        /// Which head.
+        side: &'static str,
+        /// What is wrong.
+        source: HeadError,
     },
     /// The URDF's arm or gripper lacks something.
     #[error("arm: {0}")]
@@ -101,16 +109,9 @@ impl System {
         config: &Config,
         description: &Description,
     ) -> Result<Self, SystemError> {
-        let head = |side: Side| {
-            let wiring = config.head(side);
-            let joints = [wiring.pan_joint.as_str(), wiring.tilt_joint.as_str()];
-            description
-                .chain_with("base", &wiring.optical_frame, &joints)
-                .map(|chain| PanTiltHead { chain, camera: wiring.camera.model() })
-                .map_err(|source| SystemError::Description { side: side.name(), source })
-        };
         let hand = robot.arm.is_some().then(|| Hand::read(config, description)).transpose()?;
-        let heads = [head(Side::Left)?, head(Side::Right)?];
+        let heads =
+            [head(config, description, Side::Left)?, head(config, description, Side::Right)?];
         Ok(System { robot, heads, required_signers: None, hand })
     }
 
@@ -223,9 +224,62 @@ impl System {
     }
 }
 
+/// The geometry of one head as configuration and URDF have it.
+fn head(
+    config: &Config,
+    description: &Description,
+    side: Side,
+) -> Result<PanTiltHead, SystemError> {
+    let (wiring, name) = (config.head(side), side.name());
+    let joints = [wiring.pan_joint.as_str(), wiring.tilt_joint.as_str()];
+    let chain = description
+        .chain_with("base", &wiring.optical_frame, &joints)
+        .map_err(|source| SystemError::Description { side: name, source })?;
+    PanTiltHead::new(chain, wiring.camera.model())
+        .map_err(|source| SystemError::Head { side: name, source })
+}
+
 fn untimely(side: usize, how: &str) -> DeviceError {
     DeviceError::Fault {
         device: format!("{} camera", Side::BOTH[side].name()),
         fault: format!("its time stamps lie {how} the robot's clock"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+
+    const HEAD: &str = r#"
+        pan_joint = "p"
+        tilt_joint = "t"
+        optical_frame = "eye"
+        camera = { driver = "sim", width = 320, height = 240, fx = 300.0, fy = 300.0, cx = 159.5, cy = 119.5 }
+        servos = { driver = "sim" }"#;
+
+    fn with_tilt_from(lower: &str) -> Result<PanTiltHead, SystemError> {
+        let urdf = format!(
+            r#"<robot name="r"><link name="base"/><link name="pan"/><link name="eye"/>
+            <joint name="p" type="revolute"><parent link="base"/><child link="pan"/><axis xyz="0 0 1"/>
+              <limit lower="-1" upper="1" velocity="3.6" effort="1"/></joint>
+            <joint name="t" type="revolute"><parent link="pan"/><child link="eye"/><axis xyz="0 1 0"/>
+              <limit lower="{lower}" upper="1" velocity="3.6" effort="1"/></joint></robot>"#
+        );
+        let text =
+            format!("robot = 'r.urdf'\n[left]\n{HEAD}\n[right]\n{HEAD}\n[radio]\ndriver = 'sim'\n");
+        let description = Description::parse(&urdf, Path::new("r.urdf")).unwrap();
+        head(&Config::parse(&text, Path::new("r.toml")).unwrap(), &description, Side::Right)
+    }
+
+    #[test]
+    fn a_joint_whose_range_is_none_is_refused_by_its_name() {
+        assert_eq!(with_tilt_from("-1").unwrap().clamp([0.0, -2.0]), [0.0, -1.0]);
+        for lower in ["2", "NaN"] {
+            let error = with_tilt_from(lower).unwrap_err().to_string();
+            assert!(error.starts_with("right head: joint \"t\""), "{error}");
+            assert!(error.contains("URDF"), "{error}");
+        }
     }
 }
