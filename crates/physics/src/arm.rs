@@ -128,7 +128,7 @@ impl Arm for PhysicsArm {
             self.velocities = point.velocities;
             self.step(&point.positions);
             let world = self.world();
-            let felt = world.touch().filter(|t| t.force > limits.contact_force);
+            let felt = world.felt().filter(|t| t.force > limits.contact_force);
             if let Some(touch) = felt {
                 let (link, force) = (touch.link.clone(), touch.force);
                 drop(world);

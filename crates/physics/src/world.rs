@@ -80,7 +80,7 @@ pub enum SetupError {
     Fingers(usize),
 }
 
-/// The strongest contact of the robot since it was last asked for.
+/// A contact of the robot.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Touch {
     /// Part of the robot.
@@ -107,6 +107,9 @@ pub struct World {
     strength: f64,
     squeezed: f64,
     broken: bool,
+    /// The strongest contact in the newest step.
+    felt: Option<Touch>,
+    /// And since it was last taken.
     touch: Option<Touch>,
 }
 
@@ -148,6 +151,7 @@ impl World {
             strength: setup.object.strength,
             squeezed: 0.0,
             broken: false,
+            felt: None,
             touch: None,
         })
     }
@@ -210,12 +214,19 @@ impl World {
         self.touch.as_ref()
     }
 
+    /// The strongest contact of the robot in the newest step: what a motion feels now, whatever motions
+    /// before it have touched.
+    pub fn felt(&self) -> Option<&Touch> {
+        self.felt.as_ref()
+    }
+
     fn frame(&self, k: usize) -> Transform {
         self.arm.chain().frames(&self.joints)[k - 1]
     }
 
     /// Contacts between robot and rest, and the squeeze on the object.
     fn watch(&mut self) {
+        self.felt = None;
         let mut squeeze = [0.0f64; 2];
         for pair in self.physics.narrow_phase.contact_pairs() {
             let names = (self.names.get(&pair.collider1), self.names.get(&pair.collider2));
@@ -232,9 +243,14 @@ impl World {
             if let (Some(n), true) = (finger, *other == self.object_name) {
                 squeeze[n] += force;
             }
-            if force > self.touch.as_ref().map_or(1e-3, |t| t.force) {
-                self.touch = Some(Touch { link: link.clone(), other: other.clone(), force });
+            if force > self.felt.as_ref().map_or(1e-3, |t| t.force) {
+                self.felt = Some(Touch { link: link.clone(), other: other.clone(), force });
             }
+        }
+        if let Some(felt) = &self.felt
+            && self.touch.as_ref().is_none_or(|t| felt.force > t.force)
+        {
+            self.touch = self.felt.clone();
         }
         // Squeezed is what both fingers press; a push from one side is not.
         let over = squeeze[0].min(squeeze[1]) > self.strength;

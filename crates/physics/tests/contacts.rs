@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use nalgebra::{Translation3, Vector3};
 use vergence_devices::{Arm, Execution, GripCommand, MotionLimits};
-use vergence_geometry::{Solid, Transform};
+use vergence_geometry::{Solid, Trajectory, Transform, Waypoint};
 use vergence_grasp::object::Placed;
 use vergence_grasp::{Config, Obstacle};
 use vergence_physics::experiment::{self, Cell, Conditions, HOME, table};
@@ -102,6 +102,35 @@ fn occupied_space_is_felt_and_the_arm_stops() {
     let verdict = trial::run(&mut arm, &plan).unwrap();
     assert!(!verdict.succeeded);
     assert_eq!(verdict.collision.unwrap().other, "shelf");
+}
+
+#[test]
+fn a_motion_does_not_report_what_an_earlier_one_has_touched() {
+    let planned = trial(2, |_| ());
+    let plan = planned.plan.unwrap();
+    let mut obstacles = planned.obstacles.clone();
+    let at = plan.base_from_tip.translation.vector + Vector3::z() * 0.06;
+    obstacles.push(Obstacle {
+        name: "shelf".into(),
+        base_from_solid: Translation3::from(at).into(),
+        solid: Solid::Cuboid { half: Vector3::new(0.2, 0.2, 0.005) },
+    });
+    let world = cell().world(&HOME, &obstacles, &planned.object).unwrap();
+    let mut arm = PhysicsArm::new(Arc::new(Mutex::new(world)), None);
+    trial::to_pregrasp(&mut arm, &plan).unwrap();
+    let watched = MotionLimits::default();
+    let outcome = arm.execute(&plan.approach, &watched).unwrap();
+    assert!(matches!(outcome, Execution::Contact { .. }), "{outcome:?}");
+    let point = |time: f64, positions| Waypoint { time, positions, velocities: [0.0; 6] };
+    let stands = arm.read(Duration::ZERO).unwrap().positions;
+    let pregrasp = plan.pregrasp().unwrap();
+    let back = Trajectory { waypoints: vec![point(0.0, stands), point(2.0, pregrasp)] };
+    let blind = MotionLimits { contact_force: f64::INFINITY, ..watched.clone() };
+    assert_eq!(arm.execute(&back, &blind), Ok(Execution::Reached));
+    let stay = Trajectory { waypoints: vec![point(0.0, pregrasp), point(0.2, pregrasp)] };
+    assert_eq!(arm.execute(&stay, &watched), Ok(Execution::Reached));
+    // The judge has not forgotten it.
+    assert_eq!(arm.world().take_touch().unwrap().other, "shelf");
 }
 
 #[test]
