@@ -3,7 +3,7 @@
 use std::io::Cursor;
 use std::path::Path;
 
-use image::{DynamicImage, GrayImage, ImageFormat};
+use image::{DynamicImage, GrayImage, ImageDecoder, ImageFormat};
 
 use crate::{Canvas, Image};
 
@@ -24,19 +24,50 @@ pub enum CodecError {
     /// The content is no picture that we can read.
     #[error("not a readable picture: {0}")]
     Content(#[from] image::ImageError),
+    /// The header announces more pixels than any camera of ours has.
+    #[error("a picture of {width}x{height} pixels is too large")]
+    TooLarge {
+        /// Columns.
+        width: u32,
+        /// Rows.
+        height: u32,
+    },
 }
 
 /// Decodes PNG or JPEG bytes to grey (Rec. 709 weights for colour).
 pub fn decode(bytes: &[u8]) -> Result<Image<u8>, CodecError> {
+    let decoder = open(bytes)?;
+    let (width, height) = decoder.dimensions();
+    // Before any memory is taken: a few bytes may announce gigabytes.
+    if u64::from(width) * u64::from(height) > MAX_PIXELS {
+        return Err(CodecError::TooLarge { width, height });
+    }
+    limits().reserve(decoder.total_bytes())?;
+    let gray = DynamicImage::from_decoder(decoder)?.into_luma8();
+    let (width, height) = (gray.width() as usize, gray.height() as usize);
+    Ok(Image::from_fn(width, height, |x, y| gray.as_raw()[y * width + x]))
+}
+
+/// Columns and rows that the header of PNG or JPEG bytes announces; nothing is decoded.
+pub fn size(bytes: &[u8]) -> Result<(usize, usize), CodecError> {
+    let (width, height) = open(bytes)?.dimensions();
+    Ok((width as usize, height as usize))
+}
+
+/// Reads the header.
+fn open(bytes: &[u8]) -> Result<impl ImageDecoder, CodecError> {
     let mut reader = image::ImageReader::new(Cursor::new(bytes))
         .with_guessed_format()
         .map_err(image::ImageError::IoError)?;
+    reader.limits(limits());
+    Ok(reader.into_decoder()?)
+}
+
+/// Memory for the largest picture as colour with transparency.
+fn limits() -> image::Limits {
     let mut limits = image::Limits::default();
     limits.max_alloc = Some(MAX_PIXELS * 4);
-    reader.limits(limits);
-    let gray = reader.decode()?.into_luma8();
-    let (width, height) = (gray.width() as usize, gray.height() as usize);
-    Ok(Image::from_fn(width, height, |x, y| gray.as_raw()[y * width + x]))
+    limits
 }
 
 /// Reads a PNG or JPEG file as grey.
@@ -112,5 +143,19 @@ mod tests {
         assert!(decode(b"not a picture").is_err());
         let png = encode_png(&ramp()).unwrap();
         assert!(decode(&png[..png.len() / 2]).is_err());
+    }
+
+    #[test]
+    fn a_header_that_announces_too_many_pixels_is_refused_before_decoding() {
+        let mut jpeg = encode_jpeg(&ramp(), 90).unwrap();
+        // Start of frame: marker, length, bits, rows, columns.
+        let frame = jpeg.windows(2).position(|w| w == [0xFF, 0xC0]).unwrap();
+        assert_eq!(size(&jpeg).unwrap(), (64, 48));
+        let side = 1u16 << 14;
+        jpeg[frame + 5..frame + 7].copy_from_slice(&side.to_be_bytes());
+        jpeg[frame + 7..frame + 9].copy_from_slice(&side.to_be_bytes());
+        assert_eq!(size(&jpeg).unwrap(), (1 << 14, 1 << 14));
+        let error = decode(&jpeg).unwrap_err();
+        assert!(matches!(error, CodecError::TooLarge { width: 16384, height: 16384 }), "{error}");
     }
 }
