@@ -7,7 +7,8 @@
 //! part when there is one: the camera's clock is brought to ours by the smallest delay seen lately, and
 //! pictures that the camera or the network lost are counted by it. Else the arrival of the part's
 //! header is the stamp, late by the transport. Stamps always grow, also when the camera's clock is set.
-//! A picture that is the one before, byte for byte, comes from a camera that froze, and is not taken.
+//! A picture that is the one before, byte for byte, comes from a camera that froze, and is not taken. One
+//! that cannot be decoded is skipped, and told of when no other comes in time.
 //!
 //! Exposure is not told by such cameras; the configuration may.
 //!
@@ -25,7 +26,8 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use serde::Deserialize;
-use vergence_imaging::{Frame, codec};
+use vergence_imaging::codec::{self, CodecError};
+use vergence_imaging::{Frame, Image};
 
 use crate::traits::{Camera, Clock, DeviceError};
 use multipart::{Part, StreamError};
@@ -138,43 +140,61 @@ impl MjpegCamera {
 
 impl Camera for MjpegCamera {
     fn next_frame(&mut self, timeout: Duration) -> Result<Frame, DeviceError> {
-        let device = || self.url.clone();
+        let device = self.url.clone();
         let deadline = Instant::now() + timeout;
+        let mut damage = None;
         let mut state = self.shared.lock();
-        let picture = loop {
+        loop {
             if let Some(picture) = state.pictures.pop_front() {
-                break picture;
+                drop(state);
+                match self.grey(&picture.jpeg)? {
+                    Ok(image) => {
+                        return Ok(Frame {
+                            image,
+                            stamp: picture.stamp,
+                            exposure: self.exposure,
+                            row_time: None,
+                            sequence: picture.sequence,
+                        });
+                    }
+                    // One that the network spoilt is made up for by the next.
+                    Err(what) => damage = Some(what),
+                }
+                state = self.shared.lock();
+                continue;
             }
             let left = deadline.saturating_duration_since(Instant::now());
             if left.is_zero() {
-                return Err(match state.trouble.clone() {
-                    Some(reason) => DeviceError::Disconnected { device: device(), reason },
-                    None => DeviceError::Timeout { device: device(), timeout },
+                return Err(match (damage, state.trouble.clone()) {
+                    (Some(what), _) => {
+                        let fault = format!("nothing readable within {timeout:?}, last: {what}");
+                        DeviceError::Fault { device, fault }
+                    }
+                    (None, Some(reason)) => DeviceError::Disconnected { device, reason },
+                    (None, None) => DeviceError::Timeout { device, timeout },
                 });
             }
             let waited = self.shared.news.wait_timeout(state, left);
             state = waited.unwrap_or_else(PoisonError::into_inner).0;
-        };
-        drop(state);
-        let image = codec::decode(&picture.jpeg)
-            .map_err(|e| DeviceError::Fault { device: device(), fault: e.to_string() })?;
-        if (image.width(), image.height()) != self.size {
-            let (width, height) = self.size;
-            return Err(DeviceError::Unsupported {
-                device: device(),
-                what: format!(
-                    "pictures are {}x{}, the configuration says {width}x{height}",
-                    image.width(),
-                    image.height()
-                ),
-            });
         }
-        Ok(Frame {
-            image,
-            stamp: picture.stamp,
-            exposure: self.exposure,
-            row_time: None,
-            sequence: picture.sequence,
+    }
+}
+
+impl MjpegCamera {
+    /// Decodes a picture, or says what is wrong with this one; fails when the camera delivers another size.
+    /// The header is asked first, as a picture that nobody wants may be a large one.
+    fn grey(&self, jpeg: &[u8]) -> Result<Result<Image<u8>, CodecError>, DeviceError> {
+        let (width, height) = match codec::size(jpeg) {
+            Ok(size) => size,
+            Err(damage) => return Ok(Err(damage)),
+        };
+        if (width, height) == self.size {
+            return Ok(codec::decode(jpeg));
+        }
+        let (columns, rows) = self.size;
+        Err(DeviceError::Unsupported {
+            device: self.url.clone(),
+            what: format!("pictures are {width}x{height}, the configuration says {columns}x{rows}"),
         })
     }
 }

@@ -122,6 +122,31 @@ fn silence_wrong_sizes_and_wrong_addresses_are_told() {
     assert!(matches!(open("http://127.0.0.1:1/x"), Err(DeviceError::Disconnected { .. })));
 }
 
+/// A part whose picture is cut off in its head.
+fn torn() -> Vec<u8> {
+    let body = &jpeg(7)[..40];
+    let head = format!("--frame\r\nContent-Length: {}\r\n\r\n", body.len());
+    [head.as_bytes(), body, b"\r\n"].concat()
+}
+
+#[test]
+fn a_picture_that_cannot_be_decoded_is_made_up_for_by_the_next() {
+    let url = server(vec![Box::new(|stream| {
+        stream.write_all(HEAD.as_bytes()).unwrap();
+        stream.write_all(&torn()).unwrap();
+        stream.write_all(&part(200, 1.0)).unwrap();
+        std::thread::sleep(Duration::from_millis(100));
+        stream.write_all(&torn()).unwrap();
+        std::thread::sleep(Duration::from_millis(1500));
+    })]);
+    let mut camera = open(&url).unwrap();
+    assert!(camera.next_frame(SOON).unwrap().image.data()[0] > 180);
+    let error = camera.next_frame(Duration::from_millis(400)).unwrap_err();
+    assert!(
+        matches!(&error, DeviceError::Fault { fault, .. } if fault.contains("nothing readable"))
+    );
+}
+
 #[test]
 fn a_camera_that_freezes_or_loses_pictures_is_told() {
     let url = server(vec![Box::new(|stream| {
