@@ -65,7 +65,7 @@ fn watch<F: Finder>(bencher: Bencher, video: &[Frame], start: impl Fn() -> F) {
 fn ready(patterns: usize) -> SequentialFinder {
     let finder = SequentialFinder::new(requests(patterns), Default::default());
     let mut finder = finder.expect("the requests differ");
-    finder.prepare((WIDTH, HEIGHT));
+    finder.prepare((WIDTH, HEIGHT)).expect("the pictures are small");
     finder
 }
 

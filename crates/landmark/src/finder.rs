@@ -79,6 +79,21 @@ pub enum FinderError {
         /// Rows of the frame.
         height: usize,
     },
+    /// A frame with so many pixels that those which must be remembered would not fit in memory.
+    #[error(
+        "a picture of {width}x{height} pixels is too large, {most} are the most that {frames} frames are \
+         remembered of: have the camera deliver smaller ones"
+    )]
+    TooLarge {
+        /// Columns of the frame.
+        width: usize,
+        /// Rows of the frame.
+        height: usize,
+        /// Frames that are remembered.
+        frames: usize,
+        /// Most pixels of a frame.
+        most: usize,
+    },
     /// A frame of another size than the first.
     #[error("the picture size changed from {before:?} to {now:?} (columns, rows)")]
     SizeChanged {

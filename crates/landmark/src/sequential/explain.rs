@@ -111,7 +111,7 @@ impl Watcher {
             let time = sequence.accept(frame)?;
             let (past, filtered) = past(&mut reference, frame, time, None);
             watcher.variation.push(filtered.data());
-            watcher.history.push(past, &filtered);
+            watcher.history.push(past, &filtered)?;
             let (w, h) = watcher.history.size();
             let n = watcher.history.len();
             watcher.noise = BlockNoise::new(watcher.variation.energy(), w, h, n);

@@ -10,6 +10,10 @@ use vergence_imaging::Image;
 use super::front::{GAIN, noise_correlation};
 use super::motion::Placement;
 use super::shift::weights;
+use crate::FinderError;
+
+/// Most memory for pictures (bytes): full HD over the usual window takes three quarters of it.
+const MOST_MEMORY: usize = 1 << 30;
 
 /// One frame of the past.
 #[derive(Debug, Clone)]
@@ -55,17 +59,23 @@ impl History {
     }
 
     /// Takes all memory for pictures of so many columns and rows. It is written, so that no frame has to
-    /// wait until the system hands it out.
-    pub fn prepare(&mut self, (width, height): (usize, usize)) {
+    /// wait until the system hands it out. Pictures that would need too much are refused and none is taken.
+    pub fn prepare(&mut self, (width, height): (usize, usize)) -> Result<(), FinderError> {
         if self.size != (width, height) {
+            let (frames, most) =
+                (self.capacity, MOST_MEMORY / size_of::<i16>() / self.capacity.max(1));
+            if width.saturating_mul(height) > most {
+                return Err(FinderError::TooLarge { width, height, frames, most });
+            }
             self.size = (width, height);
             self.pictures = vec![i16::MIN; width * height * self.capacity];
         }
+        Ok(())
     }
 
     /// Adds a frame and its filtered picture; when the window is full the oldest leaves.
-    pub fn push(&mut self, past: Past, filtered: &Image<i16>) {
-        self.prepare((filtered.width(), filtered.height()));
+    pub fn push(&mut self, past: Past, filtered: &Image<i16>) -> Result<(), FinderError> {
+        self.prepare((filtered.width(), filtered.height()))?;
         if self.frames.len() == self.capacity {
             if let Some(oldest) = self.frames.pop_front() {
                 self.count(&oldest.placement, -1.0);
@@ -81,6 +91,7 @@ impl History {
         for (place, row) in places.zip(filtered.data().chunks_exact(width)) {
             place.copy_from_slice(row);
         }
+        Ok(())
     }
 
     /// One row of the filtered pictures, frame by frame.
@@ -196,4 +207,20 @@ pub fn noise_share(place: Point2<f64>) -> f64 {
         }
     }
     f64::from(share)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pictures_that_would_take_the_memory_are_refused() {
+        let mut history = History::new(192);
+        let error = history.prepare((1 << 15, 1 << 15)).unwrap_err();
+        assert!(matches!(error, FinderError::TooLarge { width: 32768, .. }), "{error}");
+        assert!(history.prepare((usize::MAX, 2)).is_err());
+        assert!(history.pictures.is_empty());
+        history.prepare((64, 48)).unwrap();
+        assert_eq!(history.pictures.len(), 64 * 48 * 192);
+    }
 }

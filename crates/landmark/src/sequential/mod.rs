@@ -119,9 +119,9 @@ pub struct SequentialFinder {
 
 impl SequentialFinder {
     /// Takes the memory for pictures of so many columns and rows, which takes as long as many frames do;
-    /// otherwise the first frame does.
-    pub fn prepare(&mut self, size: (usize, usize)) {
-        self.history.prepare(size);
+    /// otherwise the first frame does. Fails when it is too much.
+    pub fn prepare(&mut self, size: (usize, usize)) -> Result<(), FinderError> {
+        self.history.prepare(size)
     }
 
     /// A finder for these requests.
@@ -294,12 +294,13 @@ impl Finder for SequentialFinder {
     fn push(&mut self, frame: &Frame) -> Result<(), FinderError> {
         let time = self.sequence.accept(frame)?;
         self.size = (frame.image.width(), frame.image.height());
+        self.history.prepare(self.size)?;
         let (past, filtered) = past(&mut self.reference, frame, time, self.spare.take());
         let pixels = self.size.0 * self.size.1;
         let window = self.config.window_frames;
         let variation = self.variation.get_or_insert_with(|| Variation::new(pixels, window));
         variation.push(filtered.data());
-        self.history.push(past, &filtered);
+        self.history.push(past, &filtered)?;
         self.spare = Some(filtered);
         self.frames += 1;
         if self.frames >= FIRST_FRAMES {

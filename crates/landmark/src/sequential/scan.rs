@@ -360,7 +360,8 @@ mod tests {
             let picture = Image::from_fn(size.0, size.1, value);
             variation.push(picture.data());
             let time = t as f64 / 30.0;
-            history.push(Past { time, exposure: 0.005, placement: Placement::default() }, &picture);
+            let past = Past { time, exposure: 0.005, placement: Placement::default() };
+            history.push(past, &picture).unwrap();
         }
         let noise = BlockNoise::new(variation.energy(), size.0, size.1, 16);
         let nuisance = Nuisance::of(&history, &Lamps::default());
