@@ -1,7 +1,8 @@
 //! The paper's own method: on/off difference, projection histogram, commanded flicker frequency.
 //!
 //! In: frames of a camera at rest. Out: one place a request, or [`Decision::Absent`], after a fixed
-//! number of frames. The steps bear the names of sections 2.2 and 2.3 of the paper:
+//! number of frames, or after fewer when no more come; too few for a spectrum leave it undecided. Frames
+//! whose stamps make no series start the watch anew. The steps bear the names of sections 2.2 and 2.3 of the paper:
 //! 1. images A and B, one with the LED on and one with it off: here two frames a chip apart, since
 //!    camera and tag share no clock;
 //! 2. blur, against the noise of a cheap camera (figure 6), and subtraction ([`difference`]);
@@ -28,6 +29,10 @@ use crate::{Decision, Finder, FinderError, Request, Sighting};
 use difference::PersistentDifference;
 use histogram::Projection;
 use spectrum::{Line, Spectrum};
+
+/// Fewest frames that are decided on when no more come: five flickers of three frames a chip, as many as
+/// there are lowest entries of the spectrum that drift covers.
+const LEAST_FRAMES: usize = 30;
 
 /// Settings of the paper's method. The paper gives no numbers; these are ours.
 #[derive(Debug, Clone, PartialEq)]
@@ -84,9 +89,7 @@ impl PaperFinder {
     /// A finder for these requests.
     pub fn new(requests: Vec<Request>, config: Config) -> Result<Self, FinderError> {
         check_requests(&requests)?;
-        let lag = |r: &Request| r.pattern.chip.as_secs_f64();
-        let differences =
-            requests.iter().map(|r| PersistentDifference::new(lag(r), config.large)).collect();
+        let differences = differences(&requests, &config);
         Ok(PaperFinder {
             decisions: vec![Decision::Undecided; requests.len()],
             requests,
@@ -106,6 +109,12 @@ impl PaperFinder {
 
     fn decide(&mut self, stamp: Duration) {
         let times: Vec<f64> = self.window.iter().map(|(t, _)| *t).collect();
+        if !spectrum::are_regular(&times) {
+            self.differences = differences(&self.requests, &self.config);
+            self.window.clear();
+            self.recent.clear();
+            return;
+        }
         for (k, request) in self.requests.iter().enumerate() {
             let difference = self.differences[k].mean();
             let projection = Projection::of(&difference);
@@ -141,6 +150,12 @@ impl PaperFinder {
         self.window.clear();
         self.recent.clear();
     }
+}
+
+/// One for each request, nothing gathered yet.
+fn differences(requests: &[Request], config: &Config) -> Vec<PersistentDifference> {
+    let lag = |r: &Request| r.pattern.chip.as_secs_f64();
+    requests.iter().map(|r| PersistentDifference::new(lag(r), config.large)).collect()
 }
 
 /// Mean of the 3x3 pixels at a place in every frame.
@@ -181,7 +196,69 @@ impl Finder for PaperFinder {
         Ok(())
     }
 
+    fn finish(&mut self) {
+        let last = self.sequence.last_stamp();
+        if let (Some(stamp), true) = (last, self.window.len() >= LEAST_FRAMES) {
+            self.decide(stamp);
+        }
+    }
+
     fn decisions(&self) -> &[Decision] {
         &self.decisions
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use vergence_tag::Pattern;
+
+    use super::*;
+    use crate::synthetic::{Light, Scene};
+
+    /// A light that flickers at 10 frames a second before the finder.
+    fn film(frames: usize) -> (PaperFinder, Vec<Frame>) {
+        let pattern = Pattern::new("10".parse().unwrap(), Duration::from_millis(300)).unwrap();
+        let request = Request { id: "cup".into(), pattern, clock_tolerance: 2e-4 };
+        let place = Point2::new(20.0, 25.0);
+        let light = Light { place, amplitude: 60.0, pattern, phase: 0.1, rate: 1.0 };
+        let scene = Scene { lights: vec![light], frame_rate: 10.0, ..Scene::flat(48, 40) };
+        let mut film = scene.film(3);
+        let frames = (0..frames).map(|_| film.next_frame().unwrap()).collect();
+        (PaperFinder::new(vec![request], Config::default()).unwrap(), frames)
+    }
+
+    #[test]
+    fn a_slow_camera_is_decided_on_with_the_frames_that_came() {
+        let (mut finder, frames) = film(60);
+        frames.iter().for_each(|frame| finder.push(frame).unwrap());
+        assert_eq!(finder.decisions(), [Decision::Undecided]);
+        finder.finish();
+        let sighting = finder.decisions()[0].brightest().unwrap();
+        assert!((sighting.pixel - Point2::new(20.0, 25.0)).norm() < 1.5, "{sighting:?}");
+        assert_eq!(sighting.frames, 60);
+    }
+
+    #[test]
+    fn too_few_frames_are_not_decided_on() {
+        let (mut finder, frames) = film(LEAST_FRAMES - 1);
+        frames.iter().for_each(|frame| finder.push(frame).unwrap());
+        finder.finish();
+        assert_eq!(finder.decisions(), [Decision::Undecided]);
+    }
+
+    #[test]
+    fn a_clock_that_jumps_by_hours_starts_the_watch_anew() {
+        let (mut finder, mut frames) = film(180);
+        for (k, frame) in frames.iter_mut().enumerate() {
+            frame.stamp = match k {
+                0..60 => Duration::from_micros(k as u64),
+                _ => frame.stamp + Duration::from_secs(36_000),
+            };
+        }
+        for (k, frame) in frames.iter().enumerate() {
+            finder.push(frame).unwrap();
+            assert_eq!(finder.is_done(), k == 179, "frame {k}: {:?}", finder.decisions());
+        }
+        assert!(finder.decisions()[0].brightest().is_some());
     }
 }

@@ -4,6 +4,10 @@ use std::f64::consts::{PI, TAU};
 
 use vergence_tag::Pattern;
 
+/// Frequencies a sample, at the most. Even sampling gives two; as many times more as the span is longer than
+/// the median gap would have it.
+const MOST_FREQUENCIES: usize = 16;
+
 /// The strongest line of a pattern's spectrum; a plain flicker's is its frequency.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Line {
@@ -45,6 +49,23 @@ impl Line {
     }
 }
 
+/// Whether samples lie so close together for the time that they span that their spectrum means something:
+/// lost frames are no matter, a clock that jumped is.
+pub fn are_regular(times: &[f64]) -> bool {
+    frequencies(times).1 <= MOST_FREQUENCIES * times.len()
+}
+
+/// Step between frequencies (Hz) and their number up to half the sampling rate.
+fn frequencies(times: &[f64]) -> (f64, usize) {
+    let (first, last) = (times.first().copied(), times.last().copied());
+    let span = (last.unwrap_or(0.0) - first.unwrap_or(0.0)).max(1e-6);
+    let mut gaps: Vec<f64> = times.windows(2).map(|w| w[1] - w[0]).collect();
+    gaps.sort_by(f64::total_cmp);
+    let rate = 1.0 / gaps.get(gaps.len() / 2).copied().unwrap_or(span).max(1e-6);
+    let step = 0.25 / span;
+    (step, ((0.5 * rate / step) as usize).saturating_add(1))
+}
+
 /// Amplitudes over frequency of a series sampled at uneven times.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Spectrum {
@@ -56,14 +77,11 @@ pub struct Spectrum {
 }
 
 impl Spectrum {
-    /// The discrete Fourier transform of `values` at `times` (s), mean removed.
+    /// The discrete Fourier transform of `values` at `times` (s), mean removed; cut off at the frequencies
+    /// that so few samples can tell when the times are not [`are_regular`].
     pub fn new(times: &[f64], values: &[f64]) -> Self {
-        let (first, last) = (times.first().copied(), times.last().copied());
-        let span = (last.unwrap_or(0.0) - first.unwrap_or(0.0)).max(1e-6);
-        let mut gaps: Vec<f64> = times.windows(2).map(|w| w[1] - w[0]).collect();
-        gaps.sort_by(f64::total_cmp);
-        let rate = 1.0 / gaps.get(gaps.len() / 2).copied().unwrap_or(span).max(1e-6);
-        let step = 0.25 / span;
+        let (step, count) = frequencies(times);
+        let count = count.min(MOST_FREQUENCIES * times.len().max(1));
         let mean = values.iter().sum::<f64>() / values.len().max(1) as f64;
         let scale = 2.0 / values.len().max(1) as f64;
         let line = |k: usize| {
@@ -75,7 +93,6 @@ impl Spectrum {
             }
             (scale * f64::hypot(re, im), im.atan2(re))
         };
-        let count = (0.5 * rate / step) as usize + 1;
         let (amplitudes, phases) = (0..count).map(line).unzip();
         Spectrum { step, amplitudes, phases }
     }
@@ -142,5 +159,19 @@ mod tests {
         assert!(!spectrum.shows(1.3 * line.frequency, 4.0));
         let into = spectrum.time_into(&line, 0.0).rem_euclid(0.14);
         assert!((into - 0.05).abs() < 0.01, "{into}");
+    }
+
+    #[test]
+    fn a_clock_that_jumps_does_not_ask_for_frequencies_without_end() {
+        let mut times: Vec<f64> = (0..90).map(|k| k as f64 / 30.0).collect();
+        assert!(are_regular(&times));
+        // Two thirds of the frames lost, most of them in one outage.
+        let lossy: Vec<f64> =
+            (0..90).map(|k| f64::from(if k < 45 { k } else { 180 + k }) / 30.0).collect();
+        assert!(are_regular(&lossy));
+        times.iter_mut().enumerate().for_each(|(k, t)| *t = 1e-6 * k as f64);
+        times[89] = 36_000.0;
+        assert!(!are_regular(&times));
+        assert!(Spectrum::new(&times, &[1.0; 90]).amplitudes.len() <= MOST_FREQUENCIES * 90);
     }
 }
