@@ -3,7 +3,8 @@
 //! Every exchange throws away what lies in the input, sends, and reads packets until the wanted
 //! servo has answered or the time is over: noise before an answer is skipped, damaged and torn
 //! answers are asked for again, [`BusConfig::attempts`] times. A packet of another servo, or the echo
-//! of our own, is not taken for an answer.
+//! of our own, is not taken for an answer: adapters on the one wire of a half-duplex bus hear themselves,
+//! and in protocol 1.0 an instruction looks like an answer with an error.
 
 use std::io;
 use std::time::{Duration, Instant};
@@ -86,14 +87,16 @@ impl Bus {
 
     /// Model number of a servo.
     pub fn ping(&mut self, protocol: Protocol, id: u8) -> Result<u16, BusError> {
+        // That of a 1.0 servo stands at the start of its table. Its answer to a ping would be the echo of
+        // that ping when it complains about its voltage.
+        if protocol == Protocol::One {
+            let answer = self.read(protocol, id, Register { address: 0, size: 2 })?;
+            return Ok(super::model::number(&answer.data) as u16);
+        }
         let answer = self.exchange(protocol, id, instruction::PING, &[], 3)?;
-        match (protocol, answer.data.as_slice()) {
-            (Protocol::Two, [low, high, ..]) => Ok(u16::from_le_bytes([*low, *high])),
-            // A 1.0 servo answers without data; its number stands at the start of the table.
-            _ => {
-                let answer = self.read(protocol, id, Register { address: 0, size: 2 })?;
-                Ok(super::model::number(&answer.data) as u16)
-            }
+        match answer.data.as_slice() {
+            [low, high, ..] => Ok(u16::from_le_bytes([*low, *high])),
+            _ => Err(BusError::Refused { id, reason: "the answer is too short".into() }),
         }
     }
 
@@ -221,10 +224,18 @@ impl Bus {
         let wire_time = Duration::from_secs_f64(10.0 * on_wire as f64 / self.config.baud as f64);
         let deadline = Instant::now() + wire_time + self.config.latency;
         let mut answers: Vec<Answer> = Vec::new();
+        let mut echoed = false;
+        let mut heard = |packet: &Frame, answers: &mut Vec<Answer>| {
+            if !echoed && packet == frame {
+                echoed = true;
+                return;
+            }
+            take(packet, frame, ids, expected, answers);
+        };
         let mut buffer = [0u8; 256];
         loop {
             while let Some(answer) = self.decoder.next_frame() {
-                take(&answer, frame, ids, expected, &mut answers);
+                heard(&answer, &mut answers);
             }
             if answers.len() == ids.len() {
                 return Ok(answers);
@@ -237,7 +248,7 @@ impl Bus {
             self.decoder.push(&buffer[..count]);
         }
         while let Some(answer) = self.decoder.after_silence() {
-            take(&answer, frame, ids, expected, &mut answers);
+            heard(&answer, &mut answers);
         }
         match (answers.len() == ids.len(), self.decoder.damaged()) {
             (true, _) => Ok(answers),

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use vergence_geometry::Limits;
 
 use super::model::Register;
-use super::transport::{open_port, pipe};
+use super::transport::{Pipe, Transport, open_port, pipe};
 use super::*;
 use crate::clock::SystemClock;
 use crate::traits::{DeviceError, PanTilt};
@@ -78,6 +78,52 @@ fn moves_and_reads_in_radians_with_both_protocols() {
         assert_eq!(bus.servos()[0].get(r.return_delay), 0);
         drop(head);
         assert_eq!(bus.servos()[0].get(r.torque_enable), 0, "released on exit");
+    }
+}
+
+/// An adapter on the one wire of a half-duplex bus: it hears what it says.
+struct Echoing {
+    wire: Pipe,
+    echo: Vec<u8>,
+}
+
+impl Transport for Echoing {
+    fn send(&mut self, bytes: &[u8]) -> std::io::Result<()> {
+        self.echo.extend_from_slice(bytes);
+        self.wire.send(bytes)
+    }
+
+    fn receive(&mut self, buffer: &mut [u8], timeout: Duration) -> std::io::Result<usize> {
+        if self.echo.is_empty() {
+            return self.wire.receive(buffer, timeout);
+        }
+        let count = self.echo.len().min(buffer.len());
+        buffer[..count].copy_from_slice(&self.echo[..count]);
+        self.echo.drain(..count);
+        Ok(count)
+    }
+
+    fn discard(&mut self) -> std::io::Result<()> {
+        self.echo.clear();
+        self.wire.discard()
+    }
+}
+
+#[test]
+fn an_echo_of_our_own_words_is_no_answer() {
+    for name in ["AX-12A", "XL430-W250"] {
+        let (servos, _) = servos(name);
+        let (ours, theirs) = pipe();
+        let _bus = VirtualBus::serve(servos, Trouble::default(), theirs);
+        let mut bus = Bus::new(Echoing { wire: ours, echo: Vec::new() }, quick());
+        let model = Model::by_name(name).unwrap();
+        let (protocol, r) = (model.protocol, &model.registers);
+        assert_eq!(bus.ping(protocol, 1).unwrap(), model.number);
+        bus.write(protocol, 1, r.goal_position, 600).unwrap();
+        let answer = bus.read(protocol, 1, r.goal_position).unwrap();
+        assert_eq!((model::number(&answer.data), answer.error), (600, 0), "{name}");
+        // Nobody has this number; the echo alone is silence.
+        assert!(matches!(bus.ping(protocol, 9), Err(BusError::Silent { id: 9 })), "{name}");
     }
 }
 
