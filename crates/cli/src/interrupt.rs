@@ -80,4 +80,8 @@ impl<P: PanTilt> PanTilt for Until<P> {
     fn backlash(&self) -> f64 {
         self.device.backlash()
     }
+
+    fn speed(&self) -> Option<f64> {
+        self.device.speed()
+    }
 }

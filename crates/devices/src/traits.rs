@@ -99,6 +99,10 @@ pub trait PanTilt: Send {
     fn backlash(&self) -> f64 {
         0.0
     }
+    /// Speed (rad/s) at which it turns; `None` when that is the joints' own.
+    fn speed(&self) -> Option<f64> {
+        None
+    }
 }
 
 /// Address of a tag on the radio; opaque bytes.

@@ -13,8 +13,10 @@ use vergence_tag::signature::TrustedKeys;
 
 /// How often moving servos are asked whether they are still.
 const POLL: Duration = Duration::from_millis(10);
-/// Allowance over the time that the slew needs at the joints' rated speed.
+/// Allowance over the time that the slew needs at the servos' speed.
 const SLEW_SLACK: Duration = Duration::from_secs(2);
+/// Slowest speed (rad/s) that a joint's description is believed: some leave it at zero.
+const SLOWEST: f64 = 0.05;
 /// Longest wait for one picture.
 const FRAME_TIMEOUT: Duration = Duration::from_secs(2);
 /// How far from its goal a servo may rest beside its step (rad): friction keeps small ones half a degree off.
@@ -137,8 +139,8 @@ impl System {
             for (joint, turn) in
                 geometry.chain.joints.iter().zip([pan - from.pan, tilt - from.tilt])
             {
-                let seconds = turn.abs() / joint.limits.velocity.max(0.05);
-                longest = longest.max(Duration::from_secs_f64(seconds));
+                let told = head.pan_tilt.speed();
+                longest = longest.max(slew_time(turn, joint.limits.velocity, told));
             }
         }
         let deadline = self.robot.clock.now() + longest + SLEW_SLACK;
@@ -224,6 +226,13 @@ impl System {
     }
 }
 
+/// Time for a turn (rad) at the slower of the joint's own speed and that which the servos were told (rad/s).
+fn slew_time(turn: f64, rated: f64, told: Option<f64>) -> Duration {
+    let rated = rated.max(SLOWEST);
+    let speed = told.filter(|told| *told > 0.0).map_or(rated, |told| told.min(rated));
+    Duration::try_from_secs_f64(turn.abs() / speed).unwrap_or(Duration::ZERO)
+}
+
 /// The geometry of one head as configuration and URDF have it.
 fn head(
     config: &Config,
@@ -271,6 +280,16 @@ mod tests {
             format!("robot = 'r.urdf'\n[left]\n{HEAD}\n[right]\n{HEAD}\n[radio]\ndriver = 'sim'\n");
         let description = Description::parse(&urdf, Path::new("r.urdf")).unwrap();
         head(&Config::parse(&text, Path::new("r.toml")).unwrap(), &description, Side::Right)
+    }
+
+    #[test]
+    fn servos_that_were_told_to_be_slow_get_the_time_for_it() {
+        assert_eq!(slew_time(-1.0, 4.0, None), Duration::from_millis(250));
+        assert_eq!(slew_time(-1.0, 4.0, Some(0.25)), Duration::from_secs(4));
+        assert_eq!(slew_time(1.0, 0.5, Some(5.0)), Duration::from_secs(2));
+        // Slower than any description is believed, since the driver knows.
+        assert_eq!(slew_time(0.5, 4.0, Some(0.01)), Duration::from_secs(50));
+        assert_eq!(slew_time(0.5, 0.0, Some(0.0)), Duration::from_secs(10));
     }
 
     #[test]

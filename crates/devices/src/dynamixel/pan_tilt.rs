@@ -36,6 +36,8 @@ struct Servo {
     zero_tick: i32,
     /// Joint radians per tick, signed.
     scale: f64,
+    /// In the model's units.
+    speed: i32,
     limits: Limits,
 }
 
@@ -117,10 +119,12 @@ impl DynamixelPanTilt {
                 super::model::MODELS.map(|m| m.name).join(", ")
             ),
         })?;
-        let servo = |config: &ServoConfig, limits: Limits| Servo {
-            id: config.id,
-            zero_tick: config.zero_tick.unwrap_or(model.centre_tick),
-            scale: if config.reversed { -model.tick } else { model.tick },
+        let units = |speed: f64| (speed / model.speed_unit).round().clamp(1.0, 1023.0) as i32;
+        let servo = |servo: &ServoConfig, limits: Limits| Servo {
+            id: servo.id,
+            zero_tick: servo.zero_tick.unwrap_or(model.centre_tick),
+            scale: if servo.reversed { -model.tick } else { model.tick },
+            speed: units(config.speed.unwrap_or(limits.velocity)),
             limits,
         };
         let servos = [servo(&config.pan, limits[0]), servo(&config.tilt, limits[1])];
@@ -135,13 +139,13 @@ impl DynamixelPanTilt {
             moving: None,
         };
         for servo in &head.servos {
-            head.prepare(servo, config.speed)?;
+            head.prepare(servo)?;
         }
         Ok(head)
     }
 
     /// Checks and sets up one servo.
-    fn prepare(&self, servo: &Servo, speed: Option<f64>) -> Result<(), DeviceError> {
+    fn prepare(&self, servo: &Servo) -> Result<(), DeviceError> {
         let (model, r) = (self.model, &self.model.registers);
         let (protocol, id) = (model.protocol, servo.id);
         let mut bus = self.lock();
@@ -178,9 +182,7 @@ impl DynamixelPanTilt {
             }
             write(&mut bus, r.return_delay, 0)?;
         }
-        let speed = speed.unwrap_or(servo.limits.velocity);
-        let units = (speed / model.speed_unit).round().clamp(1.0, 1023.0) as i32;
-        write(&mut bus, r.profile_velocity, units)?;
+        write(&mut bus, r.profile_velocity, servo.speed)?;
         // Hold where it stands: an AX given torque runs to its last goal, so that is set first.
         let here = read(&mut bus, r.present_position)?.clamp(0, model.last_tick);
         if protocol == Protocol::One {
@@ -378,6 +380,11 @@ impl PanTilt for DynamixelPanTilt {
 
     fn backlash(&self) -> f64 {
         self.backlash
+    }
+
+    fn speed(&self) -> Option<f64> {
+        let [pan, tilt] = self.servos.map(|servo| servo.speed);
+        Some(f64::from(pan.min(tilt)) * self.model.speed_unit)
     }
 }
 

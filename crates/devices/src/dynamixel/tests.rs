@@ -128,6 +128,15 @@ fn an_echo_of_our_own_words_is_no_answer() {
 }
 
 #[test]
+fn a_head_tells_the_speed_that_its_servos_were_given() {
+    let (head, bus, _) = head("AX-12A", Trouble::default());
+    let model = Model::by_name("AX-12A").unwrap();
+    let units = bus.servos()[0].get(model.registers.profile_velocity);
+    assert_eq!(head.speed(), Some(f64::from(units) * model.speed_unit));
+    assert!((head.speed().unwrap() - 5.0).abs() < model.speed_unit);
+}
+
+#[test]
 fn works_over_a_pseudo_terminal() {
     let (servos, _) = servos("XM430-W350");
     let (_bus, path) = VirtualBus::on_pty(servos, Trouble::default()).unwrap();
