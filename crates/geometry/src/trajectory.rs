@@ -49,17 +49,6 @@ impl Trajectory {
         }
         Some(point)
     }
-
-    /// The way back from a time: the same angles in the opposite order, as fast.
-    pub fn back_from(&self, time: f64) -> Trajectory {
-        let turned = |w: &Waypoint| Waypoint {
-            time: time - w.time,
-            velocities: w.velocities.map(|v| -v),
-            ..*w
-        };
-        let before = self.waypoints.iter().rev().filter(|w| w.time < time);
-        Trajectory { waypoints: self.at(time).iter().chain(before).map(turned).collect() }
-    }
 }
 
 #[cfg(test)]
@@ -76,13 +65,6 @@ mod tests {
             let point = trajectory.at(t).unwrap();
             assert!((point.positions[2] - cubic(t).0).abs() < 1e-12, "at {t}");
             assert!((point.velocities[2] - cubic(t).1).abs() < 1e-12, "at {t}");
-        }
-        let back = trajectory.back_from(1.0);
-        assert!((back.duration() - 1.0).abs() < 1e-12);
-        for t in [0.0, 0.2, 0.9] {
-            let (there, here) = (trajectory.at(1.0 - t).unwrap(), back.at(t).unwrap());
-            assert!((there.positions[0] - here.positions[0]).abs() < 1e-12, "back at {t}");
-            assert!((there.velocities[0] + here.velocities[0]).abs() < 1e-12, "back at {t}");
         }
         assert_eq!(trajectory.at(9.0).unwrap().positions, waypoint(1.5).positions);
         assert!(Trajectory::default().at(0.0).is_none());

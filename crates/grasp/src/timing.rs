@@ -11,7 +11,10 @@
 use vergence_geometry::{JointAngles, Trajectory, Waypoint};
 
 use crate::collision::blend;
-use crate::kinematics::Arm;
+use crate::kinematics::{Arm, distance};
+
+/// Step in time (s) in which the place on a trajectory is sought where the arm has stopped.
+const STOPPED_STEP: f64 = 1e-3;
 
 /// How fast the arm may move.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -73,6 +76,23 @@ pub fn parameterise(arm: &Arm, path: &[JointAngles], speeds: &Speeds) -> Traject
     Trajectory { waypoints: (0..=count).map(waypoint).collect() }
 }
 
+/// The way back to the start of a trajectory on which the arm has stopped at a posture: the same postures in
+/// the opposite order, timed anew, since the arm stands still and a controller refuses a start at speed.
+pub fn back(arm: &Arm, way: &Trajectory, stands: &JointAngles, speeds: &Speeds) -> Trajectory {
+    let time = nearest_time(way, stands);
+    let before = way.waypoints.iter().rev().filter(|w| w.time < time).map(|w| w.positions);
+    let path: Vec<JointAngles> = std::iter::once(*stands).chain(before).collect();
+    parameterise(arm, &path, speeds)
+}
+
+/// The time of a trajectory at which it is nearest to a posture.
+fn nearest_time(trajectory: &Trajectory, stands: &JointAngles) -> f64 {
+    let far = |time: f64| trajectory.at(time).map_or(0.0, |w| distance(&w.positions, stands));
+    let steps = (trajectory.duration() / STOPPED_STEP).ceil() as usize;
+    let times = (0..=steps).map(|n| (n as f64 * STOPPED_STEP).min(trajectory.duration()));
+    times.min_by(|a, b| far(*a).total_cmp(&far(*b))).unwrap_or(0.0)
+}
+
 /// Follows one trajectory by another that starts where the first ends.
 pub fn append(first: &mut Trajectory, then: &Trajectory) {
     let start = first.duration();
@@ -104,4 +124,58 @@ fn at(path: &[JointAngles], clock: &[f64], u: f64) -> JointAngles {
     let span = clock[next] - clock[next - 1];
     let s = if span > 0.0 { ((u - clock[next - 1]) / span).clamp(0.0, 1.0) } else { 1.0 };
     blend(&path[next - 1], &path[next], s)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use vergence_devices::Description;
+
+    use super::*;
+
+    #[test]
+    fn the_way_back_starts_and_ends_at_rest_and_keeps_the_limits() {
+        let text = include_str!("../assets/arm.urdf");
+        let description = Description::parse(text, Path::new("arm.urdf")).unwrap();
+        let arm = Arm::new(description.chain("base", "tcp").unwrap()).unwrap();
+        let (from, to) = ([-0.9, -0.6, 1.3, 0.0, 0.9, 0.0], [0.4, 0.2, 0.8, 0.3, 0.6, -0.5]);
+        let path: Vec<JointAngles> =
+            (0..=100).map(|n| blend(&from, &to, f64::from(n) / 100.0)).collect();
+        let speeds = Speeds::default();
+        let way = parameterise(&arm, &path, &speeds);
+        // Stopped by a contact at full speed, a little beside the way.
+        let stopped = way.at(0.6 * way.duration()).unwrap();
+        assert!(stopped.velocities.iter().any(|v| v.abs() > 0.01), "{stopped:?}");
+        let stands = stopped.positions.map(|q| q + 3e-4);
+        let back = back(&arm, &way, &stands, &speeds);
+        let (first, last) = (back.waypoints[0], back.waypoints[back.waypoints.len() - 1]);
+        assert_eq!((first.positions, first.velocities), (stands, [0.0; 6]));
+        assert_eq!(last.velocities, [0.0; 6]);
+        assert!(distance(&last.positions, &from) < 1e-9, "{last:?}");
+        let step = 1e-3;
+        for n in 0..(back.duration() / step) as usize {
+            let [a, b] = [n, n + 1].map(|n| back.at(n as f64 * step).unwrap());
+            for (joint, v) in arm.chain().joints.iter().zip(b.velocities) {
+                assert!(v.abs() <= joint.limits.velocity, "{} at {n}: {v}", joint.name);
+            }
+            let [p, q] = [a, b].map(|w| arm.forward(&w.positions).translation.vector);
+            let speed = (p - q).norm() / step;
+            assert!(speed < 1.1 * speeds.tool, "tool at {n} ms: {speed} m/s");
+            // On the way that was free when the arm came.
+            let near = path.windows(2).map(|w| distance(&w[0], &b.positions)).fold(1.0, f64::min);
+            assert!(near < 0.02, "{near} rad off at {n} ms");
+        }
+    }
+
+    #[test]
+    fn an_arm_that_has_not_left_the_start_stays() {
+        let text = include_str!("../assets/arm.urdf");
+        let description = Description::parse(text, Path::new("arm.urdf")).unwrap();
+        let arm = Arm::new(description.chain("base", "tcp").unwrap()).unwrap();
+        let start = [-0.9, -0.6, 1.3, 0.0, 0.9, 0.0];
+        let speeds = Speeds::default();
+        let way = parameterise(&arm, &[start, start.map(|q| q + 0.01)], &speeds);
+        assert_eq!(back(&arm, &way, &start, &speeds).waypoints.len(), 1);
+    }
 }

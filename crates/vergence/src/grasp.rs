@@ -28,7 +28,7 @@ use vergence_devices::{DeviceError, Execution, GripCommand, GripperReading, Moti
 use vergence_geometry::{Solid, Trajectory, Transform};
 use vergence_grasp::{
     LiftVerdict, Obstacle, Plan, Refusal, Request, correct, next_best, plan, relative_to_hand,
-    turn_in_sight, verify_lift,
+    timing, turn_in_sight, verify_lift,
 };
 
 use look::Sight;
@@ -48,8 +48,6 @@ const ANSWER: Duration = Duration::from_secs(1);
 /// Turns (rad) of the lifted hand that bring a landmark below it in sight: from under the palm's length
 /// to under its thickness, its light still turned to the heads. To one side, then to the other.
 const TURNS: [f64; 2] = [0.8, -1.6];
-/// Step in time (s) in which the place on a trajectory is sought where the arm has stopped.
-const STOPPED_STEP: f64 = 1e-3;
 
 /// Settings of a grasp.
 #[derive(Debug, Clone, Default)]
@@ -176,7 +174,7 @@ impl Attempt<'_, '_> {
         match self.carry_out(&hand, &planned) {
             Err(failure) if failure.is_worth_another_try() => {
                 self.report.first_failure = Some(failure.to_string());
-                self.step("back off", |a| a.back_off(&planned))?;
+                self.step("back off", |a| a.back_off(&hand, &planned))?;
                 let other = match failure {
                     Failure::Empty => None,
                     _ => next_best(&planned, &self.found.object.pose),
@@ -210,12 +208,13 @@ impl Attempt<'_, '_> {
 
     /// Opens the fingers and goes back the way that the arm has come; what it touched there lets go of
     /// it, so only the stop button ends this motion.
-    fn back_off(&mut self, plan: &Plan) -> Result<(), Failure> {
+    fn back_off(&mut self, hand: &Hand, plan: &Plan) -> Result<(), Failure> {
         self.grip(plan.grasp.opening, plan.force)?;
         let limits = MotionLimits { contact_force: f64::INFINITY, ..self.config.limits.clone() };
         while let Some(last) = self.way.pop() {
             let stands = self.arm()?.read(ANSWER)?.positions;
-            self.play("back off", &last.back_from(nearest_time(&last, &stands)), &limits)?;
+            let back = timing::back(&hand.robot.arm, &last, &stands, &self.config.planner.speeds);
+            self.play("back off", &back, &limits)?;
             self.way.pop();
         }
         Ok(())
@@ -415,17 +414,6 @@ impl Attempt<'_, '_> {
         };
         Err(Failure::Motion { step, what })
     }
-}
-
-/// The time of a trajectory at which it is nearest to a posture.
-fn nearest_time(trajectory: &Trajectory, stands: &[f64; 6]) -> f64 {
-    let far = |time: f64| {
-        let at = trajectory.at(time).map_or(*stands, |w| w.positions);
-        at.iter().zip(stands).map(|(a, b)| (a - b).powi(2)).sum::<f64>()
-    };
-    let steps = (trajectory.duration() / STOPPED_STEP).ceil() as usize;
-    let times = (0..=steps).map(|n| (n as f64 * STOPPED_STEP).min(trajectory.duration()));
-    times.min_by(|a, b| far(*a).total_cmp(&far(*b))).unwrap_or(0.0)
 }
 
 /// How far the second look moved the grasp (mm).
