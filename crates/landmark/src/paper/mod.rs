@@ -2,7 +2,8 @@
 //!
 //! In: frames of a camera at rest. Out: one place a request, or [`Decision::Absent`], after a fixed
 //! number of frames, or after fewer when no more come; too few for a spectrum leave it undecided. Frames
-//! whose stamps make no series start the watch anew. The steps bear the names of sections 2.2 and 2.3 of the paper:
+//! whose stamps make no series start the watch anew. The steps bear the names of sections 2.2 and 2.3 of
+//! the paper:
 //! 1. images A and B, one with the LED on and one with it off: here two frames a chip apart, since
 //!    camera and tag share no clock;
 //! 2. blur, against the noise of a cheap camera (figure 6), and subtraction ([`difference`]);
@@ -30,8 +31,8 @@ use difference::PersistentDifference;
 use histogram::Projection;
 use spectrum::{Line, Spectrum};
 
-/// Fewest frames that are decided on when no more come: five flickers of three frames a chip, as many as
-/// there are lowest entries of the spectrum that drift covers.
+/// Fewest frames that are decided on when no more come: five flickers of three frames a chip, whose line
+/// lies well above the entries of the spectrum that the background's drift covers.
 const LEAST_FRAMES: usize = 30;
 
 /// Settings of the paper's method. The paper gives no numbers; these are ours.

@@ -78,7 +78,7 @@ pub struct Spectrum {
 
 impl Spectrum {
     /// The discrete Fourier transform of `values` at `times` (s), mean removed; cut off at the frequencies
-    /// that so few samples can tell when the times are not [`are_regular`].
+    /// that so few samples can tell when the times are too irregular, see [`are_regular`].
     pub fn new(times: &[f64], values: &[f64]) -> Self {
         let (step, count) = frequencies(times);
         let count = count.min(MOST_FREQUENCIES * times.len().max(1));
