@@ -197,6 +197,9 @@ impl Attempt<'_, '_> {
         self.describe(&corrected);
         self.report.corrected_by_mm = Some(shift_mm(planned, &corrected));
         self.step("approach", |a| {
+            // As wide as the planner took the hand to be: another grasp may need another opening than
+            // that with which the fingers came here.
+            a.grip(corrected.grasp.opening, corrected.force)?;
             a.play("correction", &corrected.transfer, &a.config.limits.clone())?;
             a.play("approach", &corrected.approach, &a.config.limits.clone())
         })?;
