@@ -39,7 +39,7 @@ const LIFTED_MM: f64 = 80.0;
 pub struct Bench {
     world: SharedWorld,
     start: Transform,
-    /// 1 when the fingers have opened, 2 when they have closed.
+    /// 1 when the fingers have opened, 2 when they have closed; 1 again when they let go for another try.
     grips: usize,
     collision: Option<Touch>,
     closing_error_mm: Option<f64>,
@@ -56,13 +56,25 @@ impl Bench {
         self.world.lock().unwrap_or_else(PoisonError::into_inner).base_from_object()
     }
 
-    /// Contacts up to now are collisions as long as the fingers have not closed.
+    /// Contacts since the last call are collisions as long as the fingers have not closed; with the object
+    /// in the hand they are wanted.
     fn note_contacts(&mut self) {
-        if self.grips < 2 {
-            let mut world = self.world.lock().unwrap_or_else(PoisonError::into_inner);
-            let touch = world.take_touch().filter(|touch| touch.force >= BUMP);
-            self.collision = self.collision.take().or(touch);
-        }
+        let touch = self.take_touch().filter(|touch| touch.force >= BUMP && self.grips < 2);
+        self.collision = self.collision.take().or(touch);
+    }
+
+    /// The fingers have opened after they had closed: what moves from here on is another try and judged as
+    /// the first was. That they touched the object while they let go of it is no collision.
+    fn note_release(&mut self) {
+        self.grips = 1;
+        let touch = self
+            .take_touch()
+            .filter(|touch| touch.force >= BUMP && touch.other != self.object.name);
+        self.collision = self.collision.take().or(touch);
+    }
+
+    fn take_touch(&self) -> Option<Touch> {
+        self.world.lock().unwrap_or_else(PoisonError::into_inner).take_touch()
     }
 
     /// Writes the motions for `scripts/replay_mujoco.py` and the photographs side by side.
@@ -302,6 +314,7 @@ impl Arm for SimArm {
         bench.note_contacts();
         // A grasp that is tried again opens the fingers more than once before it closes them.
         let closing = bench.grips == 1 && command.width == 0.0;
+        let release = bench.grips == 2 && command.width > 0.0;
         bench.grips = if closing { 2 } else { bench.grips.max(1) };
         bench.motions.push(Motion::Grip(command));
         let before = bench.pose();
@@ -311,6 +324,9 @@ impl Arm for SimArm {
         if closing {
             let shift = bench.pose().translation.vector - before.translation.vector;
             bench.closing_error_mm = Some(1e3 * shift.xy().norm());
+        }
+        if release {
+            bench.note_release();
         }
         drop(bench);
         self.show();
@@ -338,6 +354,7 @@ pub fn hand(config: &Wiring, description: &Description) -> Result<Hand, Failure>
 #[cfg(test)]
 mod tests {
     use vergence::GraspConfig;
+    use vergence_geometry::Waypoint;
     use vergence_sim::Scenario;
 
     use super::*;
@@ -348,6 +365,8 @@ mod tests {
         arm: Box<dyn Arm>,
         motions: usize,
         at: usize,
+        /// What it was told since then: the fingers' widths, `None` for a motion.
+        told: Arc<Mutex<Vec<Option<f64>>>>,
     }
 
     impl Arm for Stopped {
@@ -365,6 +384,7 @@ mod tests {
             limits: &MotionLimits,
         ) -> Result<Execution, DeviceError> {
             self.motions += 1;
+            self.told.lock().unwrap().push(None);
             if self.motions != self.at {
                 return self.arm.execute(trajectory, limits);
             }
@@ -379,6 +399,7 @@ mod tests {
             command: GripCommand,
             timeout: Duration,
         ) -> Result<GripperReading, DeviceError> {
+            self.told.lock().unwrap().push(Some(command.width));
             self.arm.grip(command, timeout)
         }
 
@@ -394,14 +415,43 @@ mod tests {
             let mut robot = Opened::embedded(3, Scenario::Reach).unwrap();
             robot.attach_arm("cup", false).unwrap();
             let arm = robot.system.robot.arm.take().unwrap();
-            robot.system.robot.arm = Some(Box::new(Stopped { arm, motions: 0, at }));
+            let told = Arc::new(Mutex::new(Vec::new()));
+            let stopped = Stopped { arm, motions: 0, at, told: told.clone() };
+            robot.system.robot.arm = Some(Box::new(stopped));
             let report =
                 vergence::grasp(&mut robot.system, "cup", &GraspConfig::default(), &mut ());
             let grasp = report.grasp.unwrap();
             assert!(grasp.succeeded, "{grasp:?}");
             assert!(grasp.first_failure.as_ref().unwrap().contains("hand touched"), "{grasp:?}");
+            // Another grasp has another opening; the fingers take it before the hand goes near.
+            let told = told.lock().unwrap().clone();
+            let close = told.iter().position(|grip| *grip == Some(0.0)).unwrap();
+            let [Some(opening), None, None] = told[close - 3..close] else { panic!("{told:?}") };
+            assert!(opening > grasp.width.unwrap(), "{told:?}, {grasp:?}");
             let physics = robot.physics().unwrap();
             assert!(physics.lifted && physics.collision.is_none(), "{physics:?}");
         }
+    }
+
+    #[test]
+    fn what_the_arm_runs_into_in_a_second_try_is_a_collision_too() {
+        let mut robot = Opened::embedded(3, Scenario::Reach).unwrap();
+        robot.attach_arm("cup", false).unwrap();
+        let mut arm = robot.system.robot.arm.take().unwrap();
+        // Opened, closed on nothing, opened again.
+        for width in [0.1, 0.0, 0.1] {
+            arm.grip(GripCommand { width, force: 20.0 }, Duration::from_secs(10)).unwrap();
+        }
+        assert_eq!(robot.physics().unwrap().collision, None);
+        let stands = arm.read(Duration::ZERO).unwrap().positions;
+        let mut below = stands;
+        // Shoulder and elbow stretch until the hand is in the table.
+        below[1] += 1.9;
+        below[2] -= 0.7;
+        let point = |time, positions| Waypoint { time, positions, velocities: [0.0; 6] };
+        let down = Trajectory { waypoints: vec![point(0.0, stands), point(4.0, below)] };
+        let outcome = arm.execute(&down, &MotionLimits::default()).unwrap();
+        assert!(matches!(outcome, Execution::Contact { .. }), "{outcome:?}");
+        assert!(robot.physics().unwrap().collision.is_some());
     }
 }
