@@ -130,6 +130,10 @@ pub(crate) enum Fault {
     Lost,
     /// The tag refuses or answers nonsense; another try would not help.
     Refused(String),
+    /// A pairing with a passkey that went without it; the bond was dropped.
+    Unproven,
+    /// The tag ended the link after a pairing without its passkey.
+    Unwanted,
     /// The controller is gone.
     Dead(String),
 }
@@ -180,6 +184,16 @@ impl Fault {
             Fault::Late => DeviceError::Timeout { device, timeout },
             Fault::Lost => DeviceError::Disconnected { device, reason: "the link broke".into() },
             Fault::Refused(fault) => DeviceError::Fault { device, fault },
+            Fault::Unproven => {
+                let fault = "pairing failed: it did not ask for the passkey, so that nothing proves \
+                             it; is it this tag, and has it a passkey?";
+                DeviceError::Fault { device, fault: fault.into() }
+            }
+            Fault::Unwanted => {
+                let fault = "pairing failed: the tag ended the link afterwards; pair with its \
+                             passkey if it has one";
+                DeviceError::Fault { device, fault: fault.into() }
+            }
             Fault::Dead(reason) => DeviceError::Disconnected { device, reason },
         }
     }
