@@ -60,7 +60,8 @@ pub struct FindConfig {
     /// When the heads stop aiming again to see through the encoders' steps; the paper's method never
     /// begins.
     pub reaim: ReaimConfig,
-    /// Seed for the choice of patterns.
+    /// Seed for the choice of patterns. Whoever knows it knows what a tag will be told to blink: with
+    /// real tags, draw it from the operating system's randomness.
     pub seed: u64,
 }
 
