@@ -10,6 +10,7 @@ use std::time::Duration;
 use trouble_host::att::AttErrorCode;
 use trouble_host::{BleHostError, Error};
 use vergence_devices::{Advertisement, DeviceError, LedCommand, TagAddress, TagState};
+use vergence_firmware::store::decode_bond;
 use vergence_tag::cbor::{self, MAX_BYTES};
 use vergence_tag::{Command, gatt};
 
@@ -96,6 +97,15 @@ impl Bond {
     /// From [`Bond::to_bytes`].
     pub fn from_bytes(bytes: [u8; BOND_BYTES]) -> Self {
         Bond(bytes)
+    }
+
+    /// Both are of the same tag, so that the later one is the one that counts.
+    pub fn is_of_same_tag(&self, other: &Bond) -> bool {
+        let identity = |bond: &Bond| decode_bond(&bond.0).map(|bond| bond.identity);
+        match (identity(self), identity(other)) {
+            (Some(own), Some(other)) => own.match_identity(&other),
+            _ => false,
+        }
     }
 
     /// For a file that nobody else reads.
