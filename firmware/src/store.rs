@@ -12,7 +12,7 @@ use trouble_host::prelude::{AddrKind, BdAddr};
 use trouble_host::{Address, BondInformation, Identity, IdentityResolvingKey, LongTermKey};
 use vergence_tag::cbor::MAX_BYTES;
 
-/// Most robots that a tag remembers; the oldest makes room.
+/// Most robots that a tag remembers; the oldest of the weakest makes room.
 pub const BONDS: usize = 8;
 
 /// Bytes that hold the longest item: a record, its key, and the rounding to a flash word.
@@ -21,7 +21,7 @@ const ITEM: usize = MAX_BYTES + 64;
 pub const BOND_BYTES: usize = 16 + 7 + 16 + 1;
 
 const RECORD_KEY: u8 = 0;
-const NEXT_BOND_KEY: u8 = 1;
+const AGES_KEY: u8 = 1;
 const FIRST_BOND_KEY: u8 = 16;
 
 type Map<F> = MapStorage<u8, F, Cache<Uncached, Uncached, Uncached, u8>>;
@@ -86,25 +86,48 @@ impl<F: NorFlash> Store<F> {
         Ok(false)
     }
 
-    /// Keeps a bond: in the place of an older one of the same peer, else of the oldest.
-    pub async fn add_bond(&mut self, bond: &BondInformation) -> Result<(), StoreError> {
-        let mut place = None;
-        for index in 0..BONDS {
-            let stored = self.bond(index).await?;
-            if stored.is_some_and(|b| b.identity.match_identity(&bond.identity)) {
-                place = Some(index as u8);
+    /// Keeps a bond: in the place of an older one of the same peer, else of the oldest among the
+    /// weakest. False when it would cost a stronger one: whoever pairs without the passkey, maybe
+    /// under another's address, must not push out a robot that proved itself.
+    pub async fn add_bond(&mut self, bond: &BondInformation) -> Result<bool, StoreError> {
+        let strength = bond.security_level;
+        let mut strengths = [SecurityLevel::NoEncryption; BONDS];
+        let mut own = None;
+        for (index, kept) in strengths.iter_mut().enumerate() {
+            let Some(stored) = self.bond(index).await? else { continue };
+            *kept = stored.security_level;
+            if stored.identity.match_identity(&bond.identity) {
+                if *kept > strength {
+                    return Ok(false);
+                }
+                own = Some(index as u8);
             }
         }
-        let place = match place {
+        let place = match own {
             Some(place) => place,
             None => {
-                let next = self.get(NEXT_BOND_KEY).await?.and_then(|n| n.first().copied());
-                let next = next.unwrap_or(0) % BONDS as u8;
-                self.put(NEXT_BOND_KEY, &[(next + 1) % BONDS as u8]).await?;
-                next
+                let ages = self.ages().await?;
+                let strength_of = |place: &u8| strengths[usize::from(*place)];
+                let place = ages.iter().copied().min_by_key(strength_of).unwrap_or(0);
+                if strength_of(&place) > strength {
+                    return Ok(false);
+                }
+                let mut next = ages.iter().copied().filter(|other| *other != place);
+                let ages: [u8; BONDS] = core::array::from_fn(|_| next.next().unwrap_or(place));
+                self.put(AGES_KEY, &ages).await?;
+                place
             }
         };
-        self.put(FIRST_BOND_KEY + place, &encode_bond(bond)).await
+        self.put(FIRST_BOND_KEY + place, &encode_bond(bond)).await?;
+        Ok(true)
+    }
+
+    /// The places of the bonds, that of the oldest first.
+    async fn ages(&mut self) -> Result<[u8; BONDS], StoreError> {
+        let in_order = core::array::from_fn(|place| place as u8);
+        let stored = self.get(AGES_KEY).await?.and_then(|ages| <[u8; BONDS]>::try_from(ages).ok());
+        let complete = |ages: &[u8; BONDS]| in_order.iter().all(|place| ages.contains(place));
+        Ok(stored.filter(complete).unwrap_or(in_order))
     }
 
     /// Forgets all bonds.

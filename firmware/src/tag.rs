@@ -13,7 +13,7 @@ use embassy_time::{Duration, Instant, Timer, with_timeout};
 use embedded_storage_async::nor_flash::NorFlash;
 use trouble_host::advertise::{Advertisement, AdvertisementParameters};
 use trouble_host::att::{AttClient, AttErrorCode};
-use trouble_host::connection::Connection;
+use trouble_host::connection::{Connection, SecurityLevel};
 use trouble_host::gatt::{GattConnection, GattConnectionEvent, GattEvent, WriteEvent};
 use trouble_host::peripheral::Peripheral;
 use trouble_host::{
@@ -90,7 +90,9 @@ where
         .build();
     for index in 0..BONDS {
         // A bond that cannot be read is a robot that must pair again.
-        if let Ok(Some(bond)) = store.bond(index).await {
+        if let Ok(Some(bond)) = store.bond(index).await
+            && admits(config, bond.security_level)
+        {
             let _ = stack.add_bond_information(bond);
         }
     }
@@ -126,16 +128,38 @@ where
     }
 }
 
+/// A tag with a passkey has no use for pairings that went without it.
+fn admits(config: &Config<'_>, level: SecurityLevel) -> bool {
+    config.passkey.is_none() || level == SecurityLevel::EncryptedAuthenticated
+}
+
 /// Guesses at the passkey so far. Every failed pairing tells an attacker one more binary digit, so
 /// that the next one must wait, twice as long every time; everything else is served meanwhile.
 #[derive(Default)]
 struct Pairing {
     failures: u32,
     again: Option<Instant>,
+    /// The passkey is being tried.
+    trying: bool,
 }
 
 impl Pairing {
+    /// The link has ended. Whoever leaves in the middle may know one digit more as well.
+    fn left(&mut self) {
+        if self.trying {
+            self.failed();
+        }
+    }
+
+    /// Only a robot that knows the passkey clears the count.
+    fn completed(&mut self, level: SecurityLevel) {
+        if level == SecurityLevel::EncryptedAuthenticated {
+            *self = Pairing::default();
+        }
+    }
+
     fn failed(&mut self) {
+        self.trying = false;
         let wait = FIRST_PENALTY * (1 << self.failures.min(LONGEST_PENALTY));
         self.failures = self.failures.saturating_add(1);
         self.again = Some(Instant::now() + wait);
@@ -181,6 +205,7 @@ impl<P: PacketPool, F: NorFlash, L: Lights, B: Battery, W: Watchdog> Tag<'_, '_,
             return Ok(());
         };
         let ended = self.serve(&connection).await;
+        self.pairing.left();
         self.keep_bonds(stack).await;
         if ended {
             return Ok(());
@@ -196,11 +221,13 @@ impl<P: PacketPool, F: NorFlash, L: Lights, B: Battery, W: Watchdog> Tag<'_, '_,
     }
 
     /// Makes store and stack agree on the bonds. A pairing is told by an event, which is lost when the
-    /// robot leaves at once; and the stack does not know which bond made room for a new one.
+    /// robot leaves at once; the stack does not know which bond made room for a new one, and it lets
+    /// any pairing take the place of an earlier one under the same address.
     async fn keep_bonds<C: Controller>(&mut self, stack: &Stack<'_, Guard<C, 1>, P>) {
         type Bonds = heapless::Vec<BondInformation, { BONDS + 1 }>;
         let known = stack.with_bond_information(|bonds| bonds.iter().cloned().collect::<Bonds>());
-        for bond in known.iter().filter(|bond| bond.is_bonded) {
+        let admitted = |bond: &BondInformation| admits(self.config, bond.security_level);
+        for bond in known.iter().filter(|bond| bond.is_bonded && admitted(bond)) {
             if !matches!(self.store.holds(bond).await, Ok(true)) {
                 // A bond that is not kept costs the robot another pairing.
                 let _ = self.store.add_bond(bond).await;
@@ -209,6 +236,14 @@ impl<P: PacketPool, F: NorFlash, L: Lights, B: Battery, W: Watchdog> Tag<'_, '_,
         for bond in &known {
             if let Ok(false) = self.store.holds(bond).await {
                 let _ = stack.remove_bond_information(bond.identity);
+            }
+        }
+        for index in 0..BONDS {
+            if let Ok(Some(bond)) = self.store.bond(index).await
+                && admitted(&bond)
+                && !known.contains(&bond)
+            {
+                let _ = stack.add_bond_information(bond);
             }
         }
     }
@@ -302,8 +337,12 @@ impl<P: PacketPool, F: NorFlash, L: Lights, B: Battery, W: Watchdog> Tag<'_, '_,
                     }
                     // The passkey is about to be tried.
                     GattConnectionEvent::PassKeyDisplay(_) if !pairing.allowed() => return false,
-                    GattConnectionEvent::PairingComplete { bond, .. } => {
-                        *pairing = Pairing::default();
+                    GattConnectionEvent::PassKeyDisplay(_) => pairing.trying = true,
+                    GattConnectionEvent::PairingComplete { security_level, bond } => {
+                        pairing.completed(security_level);
+                        if !admits(config, security_level) {
+                            return false;
+                        }
                         if let Some(bond) = bond {
                             // At once: the power may fail before the link ends.
                             let _ = session.store.add_bond(&bond).await;

@@ -169,6 +169,40 @@ fn bonds_are_kept_and_the_oldest_makes_room() {
 }
 
 #[test]
+fn a_bond_without_proof_costs_no_bond_with_it() {
+    let store = &mut Flash::new().store();
+    let weak = |number: u8| BondInformation {
+        security_level: SecurityLevel::Encrypted,
+        ltk: LongTermKey::from_le_bytes([100 + number; 16]),
+        ..bond(number)
+    };
+    let mut add = |bond: BondInformation| {
+        let kept = run(store.add_bond(&bond)).unwrap();
+        assert_eq!(run(store.holds(&bond)).unwrap(), kept);
+        let keys = (0..BONDS).filter_map(|k| run(store.bond(k)).unwrap());
+        let mut keys: Vec<u8> = keys.map(|bond| bond.ltk.to_le_bytes()[0]).collect();
+        keys.sort();
+        (kept, keys)
+    };
+    assert_eq!(add(bond(1)), (true, vec![1]));
+    assert_eq!(add(weak(1)), (false, vec![1]), "under the address of a robot that proved itself");
+    assert_eq!(add(weak(2)), (true, vec![1, 102]));
+    assert_eq!(add(bond(2)), (true, vec![1, 2]), "a robot that proves itself later");
+    for number in 3..=5 {
+        add(weak(number));
+    }
+    for number in 6..=8 {
+        add(bond(number));
+    }
+    assert_eq!(add(weak(9)), (true, vec![1, 2, 6, 7, 8, 104, 105, 109]), "3 was the oldest weak");
+    assert_eq!(add(bond(10)), (true, vec![1, 2, 6, 7, 8, 10, 105, 109]), "4 was the next");
+    add(bond(11));
+    assert_eq!(add(bond(12)), (true, vec![1, 2, 6, 7, 8, 10, 11, 12]));
+    assert_eq!(add(weak(13)), (false, vec![1, 2, 6, 7, 8, 10, 11, 12]));
+    assert_eq!(add(bond(14)), (true, vec![2, 6, 7, 8, 10, 11, 12, 14]), "1 was the oldest");
+}
+
+#[test]
 fn a_flash_that_was_never_written_holds_nothing() {
     let mut store = Flash::new().store();
     assert_eq!(run(store.record(&mut [0; 1024])).unwrap(), None);

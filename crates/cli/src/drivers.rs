@@ -27,6 +27,8 @@ pub const SIM: &str = "sim";
 pub const HCI: &str = "hci";
 /// The radio driver for the Bluetooth daemon of desktop Linux.
 pub const BLUEZ: &str = "bluez";
+/// Driver of a camera that is played back.
+pub const RECORDING: &str = "recording";
 const DYNAMIXEL: &str = "dynamixel";
 
 /// The heads' devices are the simulator's; an error when some are and some are not.
@@ -129,8 +131,8 @@ fn camera(
             let opened = MjpegCamera::open(settings, size, Arc::new(clock));
             Ok(Box::new(opened.map_err(|error| failed(&error))?))
         }
-        "recording" => {
-            let opened = Playback::open(camera, folder, clock).ok_or_else(|| table("recording"))?;
+        RECORDING => {
+            let opened = Playback::open(camera, folder, clock).ok_or_else(|| table(RECORDING))?;
             Ok(Box::new(opened.map_err(|error| failed(&error))?))
         }
         #[cfg(all(target_os = "linux", target_pointer_width = "64"))]

@@ -5,6 +5,7 @@
 //! (the output says why), 2 for misuse.
 
 mod bench;
+mod bonds;
 mod commands;
 mod drivers;
 mod failure;

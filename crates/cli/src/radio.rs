@@ -1,16 +1,15 @@
 //! Opens the tag radio alone: no camera or servo is needed to talk to tags.
 
-use std::io::{Read, Write};
-use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
 use vergence_devices::clock::SystemClock;
 use vergence_devices::config::RadioConfig;
 use vergence_devices::{Clock, Config};
-use vergence_link::{BOND_BYTES, Bond, HciLink, LinkConfig, TagRadio};
+use vergence_link::{Bond, HciLink, LinkConfig, TagRadio};
 use vergence_sim::Workcell;
 use vergence_tag::signature::TrustedKeys;
 
+use crate::bonds;
 use crate::drivers::BLUEZ;
 use crate::failure::Failure;
 use crate::signing;
@@ -80,29 +79,21 @@ impl Radio {
 
     /// Takes up the bonds of earlier runs.
     fn load(&mut self) -> Result<(), Failure> {
-        let Some(path) = self.bonds.as_ref().filter(|path| path.exists()) else { return Ok(()) };
-        let mut bytes = Vec::new();
-        let read = std::fs::File::open(path).and_then(|mut file| file.read_to_end(&mut bytes));
-        read.map_err(|error| unusable(path, error))?;
-        let (bonds, rest) = bytes.as_chunks::<BOND_BYTES>();
-        if !rest.is_empty() {
-            return Err(unusable(path, "it is cut short"));
+        let Some(path) = &self.bonds else { return Ok(()) };
+        let kept = bonds::read(path).map_err(|error| unusable(path, error))?;
+        if kept.torn {
+            eprintln!("warning: {}: the last key is cut short and left out", path.display());
         }
-        for bond in bonds {
-            let added = self.link.add_bond(Bond::from_bytes(*bond));
-            added.map_err(|error| unusable(path, error))?;
+        for bond in kept.bonds {
+            self.link.add_bond(bond).map_err(|error| unusable(path, error))?;
         }
         Ok(())
     }
 
-    /// Keeps a bond for later runs; false when no file is configured. A later bond with the same tag
-    /// takes the place of an earlier one when it is read.
+    /// Keeps a bond for later runs; false when no file is configured.
     pub fn keep(&self, bond: &Bond) -> Result<bool, Failure> {
         let Some(path) = &self.bonds else { return Ok(false) };
-        let mut options = std::fs::File::options();
-        let file = options.append(true).create(true).mode(0o600).open(path);
-        file.and_then(|mut file| file.write_all(&bond.to_bytes()))
-            .map_err(|error| unusable(path, error))?;
+        bonds::keep(path, bond).map_err(|error| unusable(path, error))?;
         Ok(true)
     }
 }

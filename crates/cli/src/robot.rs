@@ -4,15 +4,17 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use clap::Args;
+use rand::TryRng;
+use rand::rngs::SysRng;
 use vergence::System;
 use vergence::report::{PhysicsReport, Report, TruthReport, numbers};
-use vergence_devices::{Config, Description, Robot};
+use vergence_devices::{Config, Description, Robot, Side};
 use vergence_geometry::Transform;
 use vergence_sim::{Scenario, SimConfig, Workcell};
 use vergence_tag::signature::TrustedKeys;
 
 use crate::bench::{self, SharedBench};
-use crate::drivers::{self, BLUEZ, HCI, SIM};
+use crate::drivers::{self, BLUEZ, HCI, RECORDING, SIM};
 use crate::failure::Failure;
 use crate::radio::{self, Radio};
 use crate::signing;
@@ -26,7 +28,8 @@ pub struct RobotArgs {
     /// Wiring of the robot (TOML); the embedded simulated workcell without it.
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
-    /// Seed of the simulated workcell and of every random choice.
+    /// Seed of the simulated workcell and of every random choice; with real devices the operating
+    /// system's randomness decides.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
 }
@@ -156,6 +159,19 @@ impl Opened {
         Ok(Opened { system, config, description, workcell, bench: None })
     }
 
+    /// What random choices are drawn from: in simulation and with recorded pictures `given`, so that a
+    /// run repeats exactly. Of real tags nobody may know beforehand what they will be told to blink, so
+    /// that the operating system's randomness decides.
+    pub fn seed(&self, given: u64) -> Result<u64, Failure> {
+        let recorded = |side| self.config.head(side).camera.driver == RECORDING;
+        if self.workcell.is_some() || Side::BOTH.into_iter().any(recorded) {
+            return Ok(given);
+        }
+        SysRng.try_next_u64().map_err(|error| {
+            Failure::failed(error, "the system gives no random numbers: is its start over?")
+        })
+    }
+
     /// The simulator, when it serves the devices.
     pub fn simulator(&self) -> Option<Arc<Workcell>> {
         self.workcell.clone()
@@ -260,4 +276,17 @@ fn check_drivers(config: &Config) -> Result<(), Failure> {
 /// A configuration that cannot be used.
 pub fn unusable(error: impl std::fmt::Display) -> Failure {
     Failure::misuse(error, "compare with the workcell that is built in: `vergence workcell DIR`")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_a_simulation_repeats_its_choices() {
+        let mut robot = Opened::embedded(1, Scenario::Default).unwrap();
+        assert_eq!(robot.seed(7).unwrap(), 7);
+        robot.workcell = None;
+        assert_ne!(robot.seed(7).unwrap(), robot.seed(7).unwrap());
+    }
 }

@@ -12,7 +12,7 @@ use bt_hci::controller::ControllerCmdSync;
 use embassy_futures::select::{Either, select};
 use embassy_time::{Timer, with_timeout};
 use trouble_host::connection::{
-    ConnectConfig, Connection, ConnectionEvent, RequestedConnParams, ScanConfig,
+    ConnectConfig, Connection, ConnectionEvent, RequestedConnParams, ScanConfig, SecurityLevel,
 };
 use trouble_host::prelude::{AddrKind, BdAddr};
 use trouble_host::scan::Scanner;
@@ -226,7 +226,15 @@ impl<'a, C: Controller + ControllerCmdSync<LeSetScanParams>> Central<'a, '_, C> 
             if outcome.is_ok() {
                 // The robot's last key may still be on its way, and the end of the link would overtake
                 // it: the tag would have no bond. A request cannot, so that its answer is the proof.
-                outcome = self.hold(&connection, tag, &Task::Info).await.and(outcome);
+                outcome = match self.hold(&connection, tag, &Task::Info).await {
+                    Ok(_) => outcome,
+                    // What a tag with a passkey does to those that paired without.
+                    Err(Fault::Lost) if passkey.is_none() => Err(Fault::Unwanted),
+                    Err(fault) => Err(fault),
+                };
+                if outcome.is_err() {
+                    let _ = self.stack.remove_bond_information(connection.peer_identity());
+                }
             }
             self.close(&connection).await;
             return outcome;
@@ -266,6 +274,14 @@ impl<'a, C: Controller + ControllerCmdSync<LeSetScanParams>> Central<'a, '_, C> 
             match connection.next().await {
                 ConnectionEvent::PassKeyInput => {
                     connection.pass_key_input(passkey.unwrap_or(0)).map_err(|_| Fault::Lost)?;
+                }
+                ConnectionEvent::PairingComplete { security_level, .. }
+                    if passkey.is_some()
+                        && security_level != SecurityLevel::EncryptedAuthenticated =>
+                {
+                    // Whatever answered never asked for the passkey: anybody can do that.
+                    let _ = self.stack.remove_bond_information(connection.peer_identity());
+                    return Err(Fault::Unproven);
                 }
                 ConnectionEvent::PairingComplete { bond, .. } => {
                     return Ok(Answer::Paired(

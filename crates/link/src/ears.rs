@@ -6,9 +6,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use bt_hci::param::{AddrKind, BdAddr, LeAdvReportsIter, LeExtAdvReportsIter};
 use trouble_host::prelude::EventHandler;
 use vergence_devices::{Advertisement, TagAddress};
-use vergence_tag::Beacon;
 use vergence_tag::beacon::short_id;
 use vergence_tag::cbor::{self, MAX_BYTES};
+use vergence_tag::{Beacon, Shown};
 
 use crate::job::{Answer, Fault, Outcome};
 
@@ -58,7 +58,8 @@ pub(crate) fn checked(mut record: Vec<u8>, claim: Option<Claim>) -> Outcome {
     {
         return Err(Fault::Refused(format!(
             "advertises \"{}\" but holds the record of \"{}\"",
-            claim.name, record.object_id
+            Shown(&claim.name),
+            record.object_id
         )));
     }
     Ok(Answer::Record(record))

@@ -10,6 +10,7 @@ use std::time::Duration;
 use trouble_host::att::AttErrorCode;
 use trouble_host::{BleHostError, Error};
 use vergence_devices::{Advertisement, DeviceError, LedCommand, TagAddress, TagState};
+use vergence_firmware::store::decode_bond;
 use vergence_tag::cbor::{self, MAX_BYTES};
 use vergence_tag::{Command, gatt};
 
@@ -98,6 +99,15 @@ impl Bond {
         Bond(bytes)
     }
 
+    /// Both are of the same tag, so that the later one is the one that counts.
+    pub fn is_of_same_tag(&self, other: &Bond) -> bool {
+        let identity = |bond: &Bond| decode_bond(&bond.0).map(|bond| bond.identity);
+        match (identity(self), identity(other)) {
+            (Some(own), Some(other)) => own.match_identity(&other),
+            _ => false,
+        }
+    }
+
     /// For a file that nobody else reads.
     pub fn to_bytes(&self) -> [u8; BOND_BYTES] {
         self.0
@@ -130,6 +140,10 @@ pub(crate) enum Fault {
     Lost,
     /// The tag refuses or answers nonsense; another try would not help.
     Refused(String),
+    /// A pairing with a passkey that went without it; the bond was dropped.
+    Unproven,
+    /// The tag ended the link after a pairing without its passkey.
+    Unwanted,
     /// The controller is gone.
     Dead(String),
 }
@@ -180,6 +194,16 @@ impl Fault {
             Fault::Late => DeviceError::Timeout { device, timeout },
             Fault::Lost => DeviceError::Disconnected { device, reason: "the link broke".into() },
             Fault::Refused(fault) => DeviceError::Fault { device, fault },
+            Fault::Unproven => {
+                let fault = "pairing failed: it did not ask for the passkey, so that nothing proves \
+                             it; is it this tag, and has it a passkey?";
+                DeviceError::Fault { device, fault: fault.into() }
+            }
+            Fault::Unwanted => {
+                let fault = "pairing failed: the tag ended the link afterwards; pair with its \
+                             passkey if it has one";
+                DeviceError::Fault { device, fault: fault.into() }
+            }
             Fault::Dead(reason) => DeviceError::Disconnected { device, reason },
         }
     }

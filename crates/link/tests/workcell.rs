@@ -224,6 +224,34 @@ fn guessing_a_passkey_takes_ever_longer() {
 }
 
 #[test]
+fn pairing_without_the_passkey_clears_no_guesses_and_costs_no_bond() {
+    let tags = vec![owned("cup", 1, Some(123_456), Access::Authenticated)];
+    let mut w = world(tags, |_| Some(-60));
+    let bond = w.link.pair(address(1), Some(123_456)).unwrap().unwrap();
+    let mut waited = 0;
+    for guess in 1..=6 {
+        let error = w.link.pair(address(1), Some(guess)).unwrap_err();
+        waited += u32::from(error.to_string().contains("the link ended"));
+        let refused = w.link.pair(address(1), None).unwrap_err();
+        assert!(refused.to_string().contains("pair with its passkey"), "{refused}");
+    }
+    assert!(waited >= 3, "only {waited} of 6 guesses had to wait");
+    // Robots have one address: the tag must still hold the bond that was made under it first.
+    w.link.add_bond(bond).unwrap();
+    assert_eq!(w.link.read_record(address(1), TIMEOUT).unwrap(), record("cup"));
+}
+
+#[test]
+fn a_tag_that_does_not_ask_for_the_passkey_is_not_believed() {
+    let mut w = world(vec![owned("cup", 1, None, Access::Encrypted)], |_| Some(-60));
+    let unproven = w.link.pair(address(1), Some(123_456)).unwrap_err();
+    assert!(unproven.to_string().contains("did not ask for the passkey"), "{unproven}");
+    let refused = w.link.read_record(address(1), TIMEOUT).unwrap_err();
+    assert!(refused.to_string().contains("not paired"), "the bond was dropped: {refused}");
+    w.link.pair(address(1), None).unwrap();
+}
+
+#[test]
 fn a_run_repeats_exactly() {
     let run = || {
         let mut w = world(vec![tag("cup", 1), tag("can", 2), tag("box", 3)], |_| Some(-60));

@@ -17,6 +17,7 @@ pub mod cose;
 pub mod gatt;
 pub mod pattern;
 pub mod record;
+mod shown;
 #[cfg(feature = "signature")]
 pub mod signature;
 pub mod upload;
@@ -28,6 +29,7 @@ pub use pattern::{Pattern, PatternError};
 pub use record::{
     BoundingBox, Invalid, LandmarkSite, Mobility, Physical, Record, Semantic, Shape, Text,
 };
+pub use shown::Shown;
 pub use upload::Upload;
 
 /// A position, direction or pair in the object frame as plain numbers (m).

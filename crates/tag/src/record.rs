@@ -3,6 +3,7 @@
 use heapless::Vec;
 
 use crate::Vec3;
+use crate::shown::is_obeyed;
 
 /// Short text in a record: identifiers, names, materials.
 pub type Text = heapless::String<48>;
@@ -161,6 +162,9 @@ pub enum Invalid {
     /// A text that must not be empty is.
     #[error("{0} is empty")]
     Empty(&'static str),
+    /// A text holds what a terminal would obey instead of showing it.
+    #[error("{0} holds a control character")]
+    Control(&'static str),
     /// The landmark lies further from the box than its housing can explain.
     #[error("landmarks: one lies more than 20 mm outside the bounding box")]
     LandmarkOutside,
@@ -185,6 +189,11 @@ impl Record {
     pub fn validate(&self) -> Result<(), Invalid> {
         if self.object_id.trim().is_empty() {
             return Err(Invalid::Empty("object_id"));
+        }
+        shows("object_id", &self.object_id)?;
+        shows("semantic.name", &self.semantic.name)?;
+        if let Some(material) = &self.physical.material {
+            shows("physical.material", material)?;
         }
         size("bounding_box.width", self.bounding_box.width)?;
         size("bounding_box.length", self.bounding_box.length)?;
@@ -274,6 +283,13 @@ fn extent(values: impl Iterator<Item = f64>) -> f64 {
     2.0 * values.fold(0.0, |widest: f64, v| widest.max(v.abs()))
 }
 
+fn shows(field: &'static str, text: &str) -> Result<(), Invalid> {
+    match text.contains(is_obeyed) {
+        true => Err(Invalid::Control(field)),
+        false => Ok(()),
+    }
+}
+
 fn finite(field: &'static str, values: &[f64]) -> Result<(), Invalid> {
     match values.iter().all(|v| v.is_finite()) {
         true => Ok(()),
@@ -335,6 +351,16 @@ mod tests {
         check(|r| r.landmarks[0].normal = [0.0; 3], Invalid::Normal);
         check(|r| r.landmarks.clear(), Invalid::Empty("landmarks"));
         check(|r| r.object_id.clear(), Invalid::Empty("object_id"));
+        let text = |text: &str| Text::try_from(text).unwrap();
+        for bad in ["cup\x1b[2J", "cup\n", "\u{202e}puc"].map(text) {
+            let (mut id, mut name, mut material) = (cup(), cup(), cup());
+            id.object_id = bad.clone();
+            name.semantic.name = bad.clone();
+            material.physical.material = Some(bad);
+            assert_eq!(id.validate(), Err(Invalid::Control("object_id")));
+            assert_eq!(name.validate(), Err(Invalid::Control("semantic.name")));
+            assert_eq!(material.validate(), Err(Invalid::Control("physical.material")));
+        }
         check(|r| r.physical.weight = Some(0.0), Invalid::Size("physical.weight"));
         check(|r| r.shape = Shape::Sphere { diameter: 0.3 }, Invalid::ShapeOutsideBox);
         let flat = heapless::Vec::from_slice(&[[0.04, 0.0], [0.0, 0.04]]).unwrap();

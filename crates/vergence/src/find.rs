@@ -16,7 +16,7 @@ use vergence_imaging::Frame;
 use vergence_landmark::FinderError;
 use vergence_pose::{ObjectPose, Query, Refusal, View};
 use vergence_tag::signature::Verdict;
-use vergence_tag::{Pattern, Record, RecordError};
+use vergence_tag::{Pattern, Record, RecordError, Shown};
 
 use crate::event::{Event, Observer};
 use crate::report::{AlternativeReport, LandmarkReport, PoseReport, Report, Step, numbers};
@@ -60,7 +60,8 @@ pub struct FindConfig {
     /// When the heads stop aiming again to see through the encoders' steps; the paper's method never
     /// begins.
     pub reaim: ReaimConfig,
-    /// Seed for the choice of patterns.
+    /// Seed for the choice of patterns. Whoever knows it knows what a tag will be told to blink: with
+    /// real tags, draw it from the operating system's randomness.
     pub seed: u64,
 }
 
@@ -76,6 +77,12 @@ impl Default for FindConfig {
             seed: 0,
         }
     }
+}
+
+/// Who was heard on the radio, for messages: the names come from the air.
+pub fn names(heard: &[Advertisement]) -> String {
+    let names: Vec<String> = heard.iter().map(|tag| Shown(&tag.object_id).to_string()).collect();
+    if names.is_empty() { "nobody".into() } else { names.join(", ") }
 }
 
 /// Why a find ended without a pose.
@@ -344,11 +351,7 @@ impl Run<'_> {
         match (wanted.next(), wanted.count()) {
             (Some(tag), 0) => Ok(tag.clone()),
             (Some(_), others) => Err(Stop::Ambiguous { object: object.into(), count: others + 1 }),
-            (None, _) => {
-                let names: Vec<&str> = heard.iter().map(|tag| tag.object_id.as_str()).collect();
-                let heard = if names.is_empty() { "nobody".into() } else { names.join(", ") };
-                Err(Stop::OutOfRange { object: object.into(), heard })
-            }
+            (None, _) => Err(Stop::OutOfRange { object: object.into(), heard: names(&heard) }),
         }
     }
 

@@ -17,6 +17,7 @@ mod system;
 pub use event::{Event, Observer};
 pub use find::{
     CollectConfig, CollectError, FindConfig, LightMover, Method, Placed, Session, collect, find,
+    names,
 };
 pub use grasp::{GraspConfig, grasp};
 pub use report::Report;

@@ -55,7 +55,8 @@ impl Guardian {
 
     /// Disarms the device, for an orderly end: "V" is the word of the kernel's watchdog interface.
     pub fn dismiss(&self) {
-        if let Some(device) = &mut self.lock().device {
+        // Closed under the lock: another word of the thread's would take this one back.
+        if let Some(mut device) = self.lock().device.take() {
             let _ = device.write_all(b"V");
         }
     }

@@ -64,12 +64,10 @@ fn run(arguments: &Arguments) -> Result<Infallible, Failure> {
     let record = executor.block_on(provide(&mut store, arguments.record.as_deref()))??;
 
     let lights = BoardLights::open(&settings.lights)?;
-    let guardian = Guardian::start(settings.watchdog.as_deref())?;
-    end_in_the_dark(lights.clone(), guardian.clone())?;
     let [a, b, c, d, e, f] = config.address;
     let holds = record.map_or("no record".into(), |id| format!("the record of \"{id}\""));
-    eprintln!("tag {f:02X}:{e:02X}:{d:02X}:{c:02X}:{b:02X}:{a:02X} holds {holds}");
-    let mut tag = TagProcess { executor, config, store, lights, guardian, settings: &settings };
+    let hello = format!("tag {f:02X}:{e:02X}:{d:02X}:{c:02X}:{b:02X}:{a:02X} holds {holds}");
+    let mut tag = TagProcess { executor, config, store, lights, settings: &settings, hello };
     match &settings.controller {
         ControllerAt::Linux { linux } => {
             tag.serve(StreamTransport::user_channel(*linux).map_err(|error| {
@@ -92,8 +90,9 @@ struct TagProcess<'a> {
     config: vergence_firmware::Config<'static>,
     store: Store<FileFlash>,
     lights: BoardLights,
-    guardian: Guardian,
     settings: &'a Settings,
+    /// What it says when it is up.
+    hello: String,
 }
 
 impl TagProcess<'_> {
@@ -103,20 +102,27 @@ impl TagProcess<'_> {
         T: Transport<Error = TransportError>,
     {
         let controller: ExternalController<T, COMMANDS> = ExternalController::new(transport);
+        // Not before the controller is there: a watchdog device that was started resets the board, and
+        // one that waits for its controller would be reset for ever.
+        let guardian = Guardian::start(self.settings.watchdog.as_deref())?;
+        end_in_the_dark(self.lights.clone(), guardian.clone())?;
         let mut board = Board {
             lights: self.lights.clone(),
             battery: PowerSupply::new(self.settings.battery.as_deref()),
-            watchdog: self.guardian.clone(),
+            watchdog: guardian.clone(),
         };
-        self.guardian.ready();
+        eprintln!("{}", self.hello);
+        guardian.ready();
         let stopped = self.executor.block_on(vergence_firmware::run::<_, HeapPool, _, _, _, _>(
             controller,
             &self.config,
             &mut self.store,
             &mut board,
-        ))?;
+        ));
         self.lights.darken();
-        stopped.map_err(|stopped| format!("the controller failed: {:?}", stopped.0).into())
+        // The service manager starts the tag again; the board has done nothing wrong.
+        guardian.dismiss();
+        stopped?.map_err(|stopped| format!("the controller failed: {:?}", stopped.0).into())
     }
 }
 

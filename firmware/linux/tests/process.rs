@@ -239,6 +239,30 @@ fn killing_it_in_the_middle_of_a_write_loses_no_record() {
 }
 
 #[test]
+fn the_watchdog_resets_no_board_whose_controller_is_missing_or_fails() {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let board = BoardFiles::new("watchdog", &listener.local_addr().unwrap().to_string());
+    let device = board.dir.join("watchdog");
+    fs::write(&device, "").unwrap();
+    let settings = board.dir.join("tag.toml");
+    let text = fs::read_to_string(&settings).unwrap();
+    fs::write(&settings, format!("{text}watchdog = {device:?}\n")).unwrap();
+
+    // A controller that hangs up at once.
+    let hangs_up = std::thread::spawn(move || drop(listener.accept().unwrap()));
+    let output = board.command().output().unwrap();
+    hangs_up.join().unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    let words = fs::read(&device).unwrap();
+    assert_eq!(words.last(), Some(&b'V'), "started and dismissed: {words:?}");
+
+    // And none at all.
+    fs::write(&device, "").unwrap();
+    assert_eq!(board.command().output().unwrap().status.code(), Some(1));
+    assert!(fs::read(&device).unwrap().is_empty(), "it was started");
+}
+
+#[test]
 fn what_does_not_work_is_named() {
     let said = |board: &BoardFiles| {
         let output = board.command().output().unwrap();

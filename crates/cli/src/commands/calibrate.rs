@@ -128,7 +128,7 @@ pub fn run(args: &Calibrate) -> Result<bool, Failure> {
 fn sightings(args: &Calibrate, opened: &mut Opened) -> Result<Session, Failure> {
     let config = CollectConfig {
         views: usize::from(args.views),
-        find: FindConfig { seed: args.seed, ..FindConfig::default() },
+        find: FindConfig { seed: opened.seed(args.seed)?, ..FindConfig::default() },
     };
     let ruler = Ruler {
         places: usize::from(args.places).next_multiple_of(2),

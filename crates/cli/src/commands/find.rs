@@ -50,8 +50,8 @@ impl From<MethodArg> for Method {
 /// Runs the command.
 pub fn run(args: &Find) -> Result<bool, Failure> {
     let mut robot = args.robot.open()?;
-    let config =
-        FindConfig { method: args.method.into(), seed: args.robot.seed, ..FindConfig::default() };
+    let seed = robot.seed(args.robot.seed)?;
+    let config = FindConfig { method: args.method.into(), seed, ..FindConfig::default() };
     let saver =
         args.save.as_deref().map(|dir| Saver::create(dir, &robot, config.method)).transpose()?;
     let mut observer = (Progress::steps(), saver);

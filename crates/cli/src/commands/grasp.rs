@@ -29,7 +29,8 @@ pub struct Grasp {
 pub fn run(args: &Grasp) -> Result<bool, Failure> {
     let mut robot = args.robot.open()?;
     robot.attach_arm(&args.object, args.save.is_some())?;
-    let find = FindConfig { seed: args.robot.seed, ..FindConfig::default() };
+    let seed = robot.seed(args.robot.seed)?;
+    let find = FindConfig { seed, ..FindConfig::default() };
     let config = GraspConfig { find, ..GraspConfig::default() };
     let saver = args
         .save

@@ -6,7 +6,7 @@ use std::time::Duration;
 use clap::{Args, Subcommand};
 use serde::Serialize;
 use vergence_devices::{DeviceError, TagAddress};
-use vergence_tag::{Pattern, Record, cbor, pattern::Bits};
+use vergence_tag::{Pattern, Record, Shown, cbor, pattern::Bits};
 
 use crate::failure::Failure;
 use crate::radio::Radio;
@@ -205,8 +205,8 @@ fn info(args: &Info) -> Result<bool, Failure> {
         return Ok(true);
     }
     println!("address   {}", output.address);
-    println!("tag       {} {}", output.manufacturer, output.model);
-    println!("firmware  {}", output.firmware);
+    println!("tag       {} {}", Shown(&output.manufacturer), Shown(&output.model));
+    println!("firmware  {}", Shown(&output.firmware));
     println!("battery   {}", output.battery.map_or("unknown".into(), |b| format!("{b} %")));
     println!("signal    {}", output.rssi.map_or("unknown".into(), |r| format!("{r} dBm")));
     let record = match (output.has_record, &output.signature) {
@@ -253,8 +253,7 @@ fn find(radio: &mut Radio, id: &str) -> Result<TagAddress, Failure> {
     match tags[..] {
         [tag] => Ok(tag),
         [] => {
-            let names: Vec<&str> = heard.iter().map(|tag| tag.object_id.as_str()).collect();
-            let names = if names.is_empty() { "nobody".into() } else { names.join(", ") };
+            let names = vergence::names(&heard);
             Err(Failure::failed(
                 format!("no tag of \"{id}\" answers on the radio (heard: {names})"),
                 "look at `vergence tags`; a tag without a record is named by its address",

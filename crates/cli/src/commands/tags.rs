@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use clap::Args;
 use serde::Serialize;
-use vergence_tag::Record;
+use vergence_tag::{Record, Shown};
 
 use crate::failure::Failure;
 use crate::radio::Radio;
@@ -93,6 +93,7 @@ fn print(tags: &[Tag]) {
             }
             (None, error) => error.clone().unwrap_or_default(),
         };
-        println!("{:<12} {:>5} {battery:>8}  {:<18} {object}", tag.id, tag.rssi, tag.address);
+        let id = Shown(&tag.id).to_string();
+        println!("{id:<12} {:>5} {battery:>8}  {:<18} {object}", tag.rssi, tag.address);
     }
 }

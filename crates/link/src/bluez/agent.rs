@@ -1,38 +1,56 @@
 //! The pairing agent: what BlueZ asks when a tag is paired.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use bluer::agent::{Agent, ReqError};
 use vergence_devices::TagAddress;
 
 /// The passkey of the tag that is being paired. Everybody else who wants one is refused.
 #[derive(Clone, Default)]
-pub(super) struct Passkeys(Arc<Mutex<Option<(TagAddress, u32)>>>);
+pub(super) struct Passkeys(Arc<Mutex<Option<Entry>>>);
+
+#[derive(Clone, Copy)]
+struct Entry {
+    tag: TagAddress,
+    passkey: u32,
+    asked: bool,
+}
 
 /// Takes the passkey back.
 pub(super) struct Permit<'a>(&'a Passkeys);
 
 impl Drop for Permit<'_> {
     fn drop(&mut self) {
-        self.0.set(None);
+        *self.0.lock() = None;
+    }
+}
+
+impl Permit<'_> {
+    /// BlueZ asked for the passkey. It tells nobody how a pairing was made, but its kernel asks in
+    /// passkey entry only, and a pairing that began so succeeds by that passkey or not at all.
+    pub fn was_used(&self) -> bool {
+        self.0.lock().is_some_and(|entry| entry.asked)
     }
 }
 
 impl Passkeys {
     /// Has the agent answer for this tag as long as the permit lives.
     pub fn permit(&self, tag: TagAddress, passkey: Option<u32>) -> Permit<'_> {
-        self.set(passkey.map(|passkey| (tag, passkey)));
+        *self.lock() = passkey.map(|passkey| Entry { tag, passkey, asked: false });
         Permit(self)
     }
 
-    fn set(&self, passkey: Option<(TagAddress, u32)>) {
-        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = passkey;
+    fn lock(&self) -> MutexGuard<'_, Option<Entry>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn of(&self, tag: TagAddress) -> Result<u32, ReqError> {
-        match *self.0.lock().unwrap_or_else(PoisonError::into_inner) {
-            Some((wanted, passkey)) if wanted == tag => Ok(passkey),
-            _ => Err(ReqError::Rejected),
+        match self.lock().as_mut().filter(|entry| entry.tag == tag) {
+            Some(entry) => {
+                entry.asked = true;
+                Ok(entry.passkey)
+            }
+            None => Err(ReqError::Rejected),
         }
     }
 
@@ -60,7 +78,10 @@ mod tests {
         let passkeys = Passkeys::default();
         assert_eq!(passkeys.of(tag), Err(ReqError::Rejected));
         let permit = passkeys.permit(tag, Some(123_456));
-        assert_eq!((passkeys.of(tag), passkeys.of(other)), (Ok(123_456), Err(ReqError::Rejected)));
+        assert_eq!(passkeys.of(other), Err(ReqError::Rejected));
+        assert!(!permit.was_used(), "another's question proves nothing");
+        assert_eq!(passkeys.of(tag), Ok(123_456));
+        assert!(permit.was_used());
         drop(permit);
         assert_eq!(passkeys.of(tag), Err(ReqError::Rejected));
         let _just_works = passkeys.permit(tag, None);

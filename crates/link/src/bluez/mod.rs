@@ -303,8 +303,14 @@ impl Radio {
             outcome = device.pair() => outcome,
             outcome = paired => outcome,
         };
+        let proven = passkey.is_none() || permit.was_used();
         drop(permit);
         match outcome {
+            Ok(()) if !proven => {
+                // BlueZ keeps the bond of a tag that never asked, unless it is told to forget it.
+                self.adapter.remove_device(Address(tag.0)).await.map_err(fault)?;
+                Err(Fault::Unproven)
+            }
             Ok(()) => Ok(Answer::Paired(None)),
             Err(error) => Err(fault::of_pairing(error)),
         }

@@ -9,7 +9,7 @@ use vergence_tag::Pattern;
 
 use crate::find::reaim::settle;
 use crate::find::search::Seen;
-use crate::find::{Found, Missing, Run, Stop};
+use crate::find::{Found, Missing, Run, Stop, names};
 use crate::system::HandLight;
 
 /// How far from where it was found the landmark may be seen at the second look (m).
@@ -41,9 +41,9 @@ impl Run<'_> {
         found: &Found,
     ) -> Result<HandSight, Stop> {
         let tag = self.heard.iter().find(|tag| tag.object_id == light.object_id).cloned();
-        let tag = tag.ok_or_else(|| {
-            let heard = self.heard.iter().map(|tag| tag.object_id.as_str()).collect::<Vec<_>>();
-            Stop::OutOfRange { object: light.object_id.clone(), heard: heard.join(", ") }
+        let tag = tag.ok_or_else(|| Stop::OutOfRange {
+            object: light.object_id.clone(),
+            heard: names(&self.heard),
         })?;
         let record = self.record(&tag)?;
         let base_from_tag = light.chain.forward(joints);
