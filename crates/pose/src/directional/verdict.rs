@@ -10,7 +10,8 @@
 //! it is not quite where it is, but then all its edges are off by the same; and which side of it is
 //! the brighter seldom changes along it. Chance edges agree in neither. Both are unknown, so both
 //! are summed out: the offset on a grid with the heavy-tailed prior that the refinement uses, the
-//! bright side over outer, inner and "changes".
+//! bright side over outer, inner and "changes". So is which edge of a lip shows: the outer one, the
+//! inner one, or both, which tells an open rim from a closed one.
 
 use super::equations::OFFSET_TAIL;
 use super::refine::{absence, deviation, independent};
@@ -79,66 +80,86 @@ const PRODUCT: usize = 24;
 /// Edges further than this many deviations from all places that the grid allows count nothing.
 const FAR: f64 = 5.0;
 
-/// Log-likelihood ratio of one part in one view, its offset and its bright side summed out.
+/// How often the outer and the inner edge of a lip show along a rim, any of the three as likely: a lip
+/// has one colour, and what is beside it seldom changes.
+const LIP_SHOWS: [[f64; 2]; 3] = [[1.0, 0.1], [0.1, 1.0], [1.0, 1.0]];
+
+/// Log-likelihood ratio of one part in one view, with its offset, its bright side and what shows of a
+/// lip summed out.
 fn part_evidence(part: &[Site], sd_px: f64, density: f64) -> f64 {
     let at = |j: usize| (j as f64 - REACH as f64) * STEP;
-    // By bright side (outer, inner, either) and by offset.
-    let mut sums = [[0.0f64; GRID]; 3];
+    let lip = part.iter().any(|site| site.inner.is_some());
+    let shows = if lip { &LIP_SHOWS[..] } else { &[[1.0, 0.0]] };
+    // By what shows, by bright side (outer, inner, either) and by offset.
+    let mut sums = vec![[[0.0f64; GRID]; 3]; shows.len()];
+    let mut product = sums.clone();
     for sites in part.chunks(PRODUCT) {
-        let mut product = [[1.0f64; GRID]; 3];
+        product.fill([[1.0; GRID]; 3]);
         for site in sites {
             let missing = absence(site.kind);
-            let [inner, outer] = likelihoods(site, sd_px, (1.0 - missing) / density);
-            for j in 0..GRID {
-                let (a, b) = (outer[j], inner[j]);
-                product[0][j] *= missing + 2.0 * (a + WRONG_SIDE * (b - a));
-                product[1][j] *= missing + 2.0 * (b + WRONG_SIDE * (a - b));
-                product[2][j] *= missing + a + b;
+            let scale = (1.0 - missing) / density;
+            let outer = likelihoods(site, 0.0, sd_px, scale);
+            let inner = site.inner.map(|place| (place, likelihoods(site, place, sd_px, scale)));
+            for (product, shows) in product.iter_mut().zip(shows) {
+                let mut edge = outer.map(|side| side.map(|l| shows[0] * l));
+                if let Some((place, inner)) = &inner {
+                    // Edges too close to be two must not count twice.
+                    let same = (-0.25 * (place / sd_px).powi(2)).exp();
+                    let share = shows[1] * (1.0 - same * shows[0].min(shows[1]));
+                    for (edge, l) in edge.iter_mut().flatten().zip(inner.iter().flatten()) {
+                        *edge += share * l;
+                    }
+                }
+                let [dark, bright] = edge;
+                for j in 0..GRID {
+                    let (a, b) = (bright[j], dark[j]);
+                    product[0][j] *= missing + 2.0 * (a + WRONG_SIDE * (b - a));
+                    product[1][j] *= missing + 2.0 * (b + WRONG_SIDE * (a - b));
+                    product[2][j] *= missing + a + b;
+                }
             }
         }
-        for (sum, factor) in sums.iter_mut().flatten().zip(product.iter().flatten()) {
-            *sum += factor.ln();
-        }
+        let factors = product.iter().flatten().flatten();
+        sums.iter_mut().flatten().flatten().zip(factors).for_each(|(s, f)| *s += f.ln());
     }
     let worth = part.iter().map(independent).sum::<f64>() / part.len() as f64;
-    let most = worth * sums.iter().flatten().fold(f64::NEG_INFINITY, |a, &b| a.max(b));
+    let most = sums.iter().flatten().flatten().fold(f64::NEG_INFINITY, |a, &b| a.max(b));
     let (mut total, mut priors) = (0.0, 0.0);
     for j in 0..GRID {
         // Student's t.
         let prior = (1.0 + at(j).powi(2) / OFFSET_TAIL).powf(-0.5 * (OFFSET_TAIL + 1.0));
-        let [outer, inner, either] = [0, 1, 2].map(|m| (worth * sums[m][j] - most).exp());
-        total += prior * (0.5 * (1.0 - CHANGES) * (outer + inner) + CHANGES * either);
-        priors += prior;
+        for sums in &sums {
+            let [outer, inner, either] = [0, 1, 2].map(|m| (worth * (sums[m][j] - most)).exp());
+            total += prior * (0.5 * (1.0 - CHANGES) * (outer + inner) + CHANGES * either);
+            priors += prior;
+        }
     }
-    most + (total / priors).ln()
+    worth * most + (total / priors).ln()
 }
 
-/// Sum over the edges of a site, those brighter inside and those brighter outside, of how likely
-/// each is, for every offset of the grid; all times `scale`.
-fn likelihoods(site: &Site, sd_px: f64, scale: f64) -> [[f64; GRID]; 2] {
+/// How likely the edges of a site are for a contour at this place (px along the normal), those brighter
+/// inside and those brighter outside, for every offset of the grid; all times `scale`.
+fn likelihoods(site: &Site, place: f64, sd_px: f64, scale: f64) -> [[f64; GRID]; 2] {
     let mut sums = [[0.0; GRID]; 2];
     let common = site.offset_sd() * site.px_per_metre;
     let local = sd_px.powi(2) + (BENT * common).powi(2);
-    let places = if site.inner.is_some() { 2.0 } else { 1.0 };
-    for (place, _) in site.places() {
-        for c in site.edges() {
-            let r = c.offset - place;
-            let sd = (local + c.noise_px * c.noise_px).sqrt();
-            let step = STEP * common / sd;
-            let first = r / sd + REACH as f64 * step;
-            if r.abs() > FAR * sd + REACH as f64 * STEP * common {
-                continue;
-            }
-            // A Gaussian on an even grid: its logarithm has constant second differences.
-            let peak = scale * c.weight / (places * sd * (2.0 * std::f64::consts::PI).sqrt());
-            let mut value = peak * (-0.5 * first * first).exp();
-            let mut ratio = (step * first - 0.5 * step * step).exp();
-            let change = (-step * step).exp();
-            for sum in &mut sums[usize::from(c.slope > 0.0)] {
-                *sum += value;
-                value *= ratio;
-                ratio *= change;
-            }
+    for c in site.edges() {
+        let r = c.offset - place;
+        let sd = (local + c.noise_px * c.noise_px).sqrt();
+        let step = STEP * common / sd;
+        let first = r / sd + REACH as f64 * step;
+        if r.abs() > FAR * sd + REACH as f64 * STEP * common {
+            continue;
+        }
+        // A Gaussian on an even grid: its logarithm has constant second differences.
+        let peak = scale * c.weight / (sd * (2.0 * std::f64::consts::PI).sqrt());
+        let mut value = peak * (-0.5 * first * first).exp();
+        let mut ratio = (step * first - 0.5 * step * step).exp();
+        let change = (-step * step).exp();
+        for sum in &mut sums[usize::from(c.slope > 0.0)] {
+            *sum += value;
+            value *= ratio;
+            ratio *= change;
         }
     }
     sums
@@ -172,6 +193,30 @@ mod tests {
         assert!(shifted > scattered + 1.0, "{shifted:.1} against {scattered:.1}");
         let flickering = evidence(&part(|k| (0.5, if k % 2 == 0 { 5.0 } else { -5.0 })));
         assert!(shifted > flickering + 1.0, "{shifted:.1} against {flickering:.1}");
+    }
+
+    #[test]
+    fn a_lip_proves_more_when_it_shows_alike_all_along_and_most_by_both_edges() {
+        let lip = |sites: Vec<Site>| {
+            let rim = |s| Site { kind: Kind::Rim, inner: Some(-1.0), ..s };
+            evidence(&sites.into_iter().map(rim).collect::<Vec<_>>())
+        };
+        let outer = lip(part(|_| (0.0, 5.0)));
+        let flickering = lip(part(|k| (if k % 2 == 0 { 0.0 } else { -1.0 }, 5.0)));
+        assert!(outer > flickering + 0.5, "{outer:.1} against {flickering:.1}");
+        let mut both = part(|_| (0.0, 5.0));
+        for site in &mut both {
+            site.candidates[1] = Candidate { offset: -1.0, ..site.candidates[0] };
+            site.count = 2;
+        }
+        let both = lip(both);
+        assert!(both > outer + 0.5, "{both:.1} against {outer:.1}");
+        // A lip too thin to be seen: its one edge proves no more than a plain one.
+        let thin = |s| Site { kind: Kind::Rim, inner: Some(-0.1), ..s };
+        let thin: Vec<Site> = part(|_| (0.0, 5.0)).into_iter().map(thin).collect();
+        let plain: Vec<Site> = thin.iter().map(|s| Site { inner: None, ..s.clone() }).collect();
+        let (thin, plain) = (evidence(&thin), evidence(&plain));
+        assert!((thin - plain).abs() < 0.2, "{thin:.2} against {plain:.2}");
     }
 
     #[test]
