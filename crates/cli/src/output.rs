@@ -1,4 +1,8 @@
-//! Machine output: one JSON document on standard output.
+//! Standard output: text for people, or one JSON document for machines.
+
+use std::fmt::Arguments;
+use std::io::{ErrorKind, Write};
+use std::path::Path;
 
 use serde::Serialize;
 
@@ -8,6 +12,46 @@ use crate::failure::Failure;
 pub fn json(value: &impl Serialize) -> Result<(), Failure> {
     let text = serde_json::to_string_pretty(value)
         .map_err(|error| Failure::failed(error, "report this as a defect"))?;
-    println!("{text}");
+    outln!("{text}");
     Ok(())
+}
+
+/// `print!` for a reader who may have left.
+macro_rules! out {
+    ($($text:tt)*) => { $crate::output::write(format_args!($($text)*)) };
+}
+
+/// The same with the end of a line.
+macro_rules! outln {
+    () => { $crate::output::write(format_args!("\n")) };
+    ($($text:tt)*) => { $crate::output::write(format_args!("{}\n", format_args!($($text)*))) };
+}
+
+pub(crate) use {out, outln};
+
+/// Writes to standard output. A reader who has seen enough (`| head`) ends the program quietly;
+/// output that cannot be kept (a full disk) ends it with a message and exit status 1.
+pub fn write(text: Arguments) {
+    let mut out = std::io::stdout().lock();
+    let Err(error) = out.write_fmt(text).and_then(|()| out.flush()) else { return };
+    if error.kind() == ErrorKind::BrokenPipe {
+        std::process::exit(0);
+    }
+    let failure = Failure::failed(
+        format!("cannot write to standard output: {error}"),
+        "make room where the output goes",
+    );
+    eprintln!("{failure}");
+    std::process::exit(failure.status.into());
+}
+
+/// Refuses a name for a configuration whose URDF, beside it, would have the same.
+pub fn not_urdf(path: &Path) -> Result<(), Failure> {
+    if path.extension().is_none_or(|extension| extension != "urdf") {
+        return Ok(());
+    }
+    Err(Failure::misuse(
+        format!("{} would be both the configuration and its URDF", path.display()),
+        "name the configuration FILE.toml; its URDF goes beside it",
+    ))
 }

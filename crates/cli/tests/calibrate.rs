@@ -78,3 +78,22 @@ fn too_little_is_refused_with_what_is_missing() {
     assert!(!folder.join("better.toml").exists());
     std::fs::remove_dir_all(&folder).unwrap();
 }
+
+#[test]
+fn what_was_read_is_not_written_over() {
+    let folder = perturbed("calibrate-over");
+    let read = || ["robot.toml", "workcell.urdf"].map(|f| std::fs::read(folder.join(f)).unwrap());
+    let before = read();
+    for out in ["robot.toml", "./workcell.toml", "new.urdf"] {
+        let arguments = ["calibrate", "--config", "robot.toml", "--out", out];
+        let output = Command::new(env!("CARGO_BIN_EXE_vergence"))
+            .args(arguments)
+            .current_dir(&folder)
+            .output()
+            .unwrap();
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{out}: {said}");
+    }
+    assert!(read() == before);
+    std::fs::remove_dir_all(&folder).unwrap();
+}

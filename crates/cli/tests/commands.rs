@@ -151,6 +151,22 @@ fn a_user_edits_the_workcell() {
     }
 }
 
+/// Output that nobody wants to read on, and output that cannot be kept.
+#[cfg(target_os = "linux")]
+#[test]
+fn a_reader_may_leave_and_a_full_disk_is_told() {
+    let command = || Command::new(env!("CARGO_BIN_EXE_vergence"));
+    let (reader, writer) = std::io::pipe().unwrap();
+    drop(reader);
+    let output = command().args(["evaluate", "equation"]).stdout(writer).output().unwrap();
+    assert_eq!((output.status.code(), output.stderr.len()), (Some(0), 0));
+    let full = std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
+    let output = command().args(["evaluate", "equation"]).stdout(full).output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("cannot write to standard output"), "{said}");
+}
+
 #[test]
 fn misuse_is_two() {
     let missing = vergence(&["find", "cup", "--config", "no/such/file.toml"]);

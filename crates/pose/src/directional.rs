@@ -82,6 +82,9 @@ pub struct Config {
     pub different: f64,
     /// Share of the contour that must lie on edges.
     pub least_coverage: f64,
+    /// Evidence against chance (nats) below which the best pose is refused: odds as against other
+    /// poses.
+    pub least_evidence: f64,
     /// Belief in the best pose below which it is refused.
     pub least_confidence: f64,
     /// Turn (rad) between two pictures beyond which a tracked object counts as lost.
@@ -105,6 +108,7 @@ impl Default for Config {
             distinct: 2f64.to_radians(),
             different: 12f64.to_radians(),
             least_coverage: 0.5,
+            least_evidence: 2.2,
             least_confidence: 0.9,
             most_turn: 15f64.to_radians(),
         }
@@ -251,7 +255,8 @@ fn prepare<'a>(
             let depth = (p.z - reach).max(0.5 * p.z);
             let reach_px = reach * view.camera.fx.max(view.camera.fy) / depth + MARGIN_PX;
             let mut scale = 1;
-            while reach_px / scale as f64 > config.reach_px {
+            let largest = view.image.width().max(view.image.height());
+            while reach_px / scale as f64 > config.reach_px && scale < largest {
                 scale *= 2;
             }
             let region = region(view, &around, &pixel, reach_px)?;
@@ -373,6 +378,7 @@ impl Search<'_> {
     }
 
     /// The best pose with its belief against the different ones, or a refusal.
+    #[expect(clippy::neg_cmp_op_on_partial_ord, reason = "what is not a number is refused")]
     fn verdict(&self, different: &[(Refined, Explained)]) -> Result<ObjectPose, Refusal> {
         let Some(((best, explained), others)) = different.split_first() else {
             return Err(Refusal::NoAttitude);
@@ -391,10 +397,13 @@ impl Search<'_> {
             alternatives,
             symmetry: self.query.symmetry(),
         };
-        if found.coverage < self.config.least_coverage {
+        if !(found.coverage >= self.config.least_coverage) {
             return Err(Refusal::TooFewEdges { best: Box::new(found) });
         }
-        if found.confidence < self.config.least_confidence {
+        if !(explained.evidence >= self.config.least_evidence) {
+            return Err(Refusal::Chance { nats: explained.evidence, best: Box::new(found) });
+        }
+        if !(found.confidence >= self.config.least_confidence) {
             return Err(Refusal::Ambiguous { best: Box::new(found) });
         }
         Ok(found)

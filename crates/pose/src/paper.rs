@@ -178,7 +178,10 @@ fn correlation(
     let (mut sum, mut points) = (0.0, 0usize);
     for (view, field) in views.iter().zip(fields) {
         for [from, to] in template(view, model, pose) {
-            let n = ((to - from).norm() / config.step_px).ceil().max(1.0) as usize;
+            // A line that passes close by the camera may be endless: it is followed in larger steps.
+            let most = 3.0 * (view.camera.width + view.camera.height) as f64;
+            let length = (to - from).norm().min(most);
+            let n = (length / config.step_px).ceil().max(1.0) as usize;
             points += n;
             for k in 0..n {
                 let p = from + (to - from) * ((k as f64 + 0.5) / n as f64);

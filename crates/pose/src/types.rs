@@ -183,6 +183,15 @@ pub enum Refusal {
     /// The landmark's position or covariance is not usable.
     #[error("the landmark's position or covariance is not usable")]
     BadLandmark,
+    /// A camera's place or the deviation of its angles is not a number.
+    #[error("the place of picture {view}'s camera is not usable")]
+    BadPlace {
+        /// Which picture, from zero.
+        view: usize,
+    },
+    /// The direction of gravity is not a number.
+    #[error("the direction of gravity is not usable")]
+    BadVertical,
     /// The landmark is in front of no camera.
     #[error("the landmark is outside every picture")]
     OutOfView,
@@ -192,6 +201,14 @@ pub enum Refusal {
     /// Too little of the best contour lies on edges.
     #[error("only {:.0} % of the best contour lies on edges", 100.0 * .best.coverage)]
     TooFewEdges {
+        /// The best guess, not to be relied on.
+        best: Box<ObjectPose>,
+    },
+    /// Edges fit the best pose hardly better than they would by chance, as in mere clutter.
+    #[error("the edges fit the best pose little better than chance would ({nats:.1} nats)")]
+    Chance {
+        /// Logarithm of the likelihood ratio against chance.
+        nats: f64,
         /// The best guess, not to be relied on.
         best: Box<ObjectPose>,
     },
@@ -216,6 +233,7 @@ impl Refusal {
     pub fn best_guess(&self) -> Option<&ObjectPose> {
         match self {
             Refusal::TooFewEdges { best }
+            | Refusal::Chance { best, .. }
             | Refusal::Ambiguous { best }
             | Refusal::Lost { best, .. } => Some(best),
             _ => None,
@@ -242,8 +260,21 @@ pub(crate) fn check(
     let site = query.landmark_in_object().ok_or(Refusal::NoLandmark(query.landmark_index))?;
     let covariance: &Matrix3<f64> = &query.landmark.covariance;
     let finite = query.landmark.position.coords.iter().chain(covariance).all(|v| v.is_finite());
-    if !finite || covariance.cholesky().is_none() {
+    // Beyond a kilometre nothing is known, and squares of such numbers overflow.
+    let sane = covariance.iter().all(|v| v.abs() < 1e6);
+    if !finite || !sane || covariance.cholesky().is_none() {
         return Err(Refusal::BadLandmark);
+    }
+    let placed = |v: &View| {
+        let place = &v.base_from_optical;
+        let numbers = place.translation.vector.iter().chain(place.rotation.coords.iter());
+        v.turn_sd.is_finite() && numbers.into_iter().all(|n| n.is_finite())
+    };
+    if let Some(view) = views.iter().position(|v| !placed(v)) {
+        return Err(Refusal::BadPlace { view });
+    }
+    if query.up.is_some_and(|up| !up.iter().all(|n| n.is_finite())) {
+        return Err(Refusal::BadVertical);
     }
     let seen = |v: &View| {
         let p = v.base_from_optical.inverse_transform_point(&query.landmark.position);

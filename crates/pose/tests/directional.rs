@@ -7,7 +7,7 @@ use vergence_geometry::{Camera, GaussianPoint, Transform};
 use vergence_imaging::Image;
 use vergence_pose::directional::{self, Config};
 use vergence_pose::{Query, Refusal, View};
-use vergence_tag::Record;
+use vergence_tag::{BoundingBox, Record, Shape};
 
 const SIDES: [f64; 3] = [0.10, 0.16, 0.07];
 
@@ -205,4 +205,39 @@ fn nonsense_is_refused_by_name() {
     query.landmark.position.x = f64::NAN;
     let result = directional::recognise(&scene.views(), &query, &config);
     assert_eq!(result, Err(Refusal::BadLandmark));
+    let mut query = scene.query(&record, false);
+    query.landmark.covariance *= 1e160;
+    let result = directional::recognise(&scene.views(), &query, &config);
+    assert_eq!(result, Err(Refusal::BadLandmark));
+    let mut query = scene.query(&record, false);
+    query.up = Some(Unit::new_unchecked(Vector3::new(0.0, f64::NAN, 1.0)));
+    let result = directional::recognise(&scene.views(), &query, &config);
+    assert_eq!(result, Err(Refusal::BadVertical));
+    let query = scene.query(&record, false);
+    let mut views = scene.views();
+    views[1].base_from_optical.translation.x = f64::NAN;
+    let result = directional::recognise(&views, &query, &config);
+    assert_eq!(result, Err(Refusal::BadPlace { view: 1 }));
+}
+
+#[test]
+fn a_lens_that_bends_the_contour_far_outwards_takes_no_more_time() {
+    // 30 cm from a large box with such a lens, ends of its edges are at billions of pixels.
+    let mut record = record();
+    record.bounding_box = BoundingBox { width: 0.3, length: 0.5, height: 0.4 };
+    record.shape = Shape::Box;
+    record.landmarks[0].position = [-0.15, 0.0, 0.0];
+    record.landmarks[0].normal = [-1.0, 0.0, 0.0];
+    let scene = Scene::new(UnitQuaternion::identity(), 1);
+    let mut views = scene.views();
+    for view in &mut views {
+        view.camera.distortion.k1 = 0.1;
+        view.camera.distortion.k3 = 5.0;
+    }
+    let eye = views[0].eye();
+    let ahead = views[0].base_from_optical.rotation * Vector3::z();
+    let mut query = scene.query(&record, false);
+    query.landmark.position = eye + 0.2 * ahead;
+    // Any answer will do, as long as it comes: without a bound this takes hours.
+    let _ = directional::recognise(&views[..1], &query, &Config::default());
 }

@@ -12,6 +12,7 @@ use vergence_head::{Noise, PanTiltHead};
 
 use crate::failure::Failure;
 use crate::light::{Person, Ruler, SimulatedPerson};
+use crate::output::outln;
 use crate::progress::Progress;
 use crate::robot::{BUILT, Opened, RobotArgs};
 
@@ -100,8 +101,10 @@ pub fn run(args: &Calibrate) -> Result<bool, Failure> {
             "give them in metres, for example --length 0.5 --length-sigma 0.0005",
         ));
     }
+    crate::output::not_urdf(&args.out)?;
     let robot = RobotArgs { config: Some(args.config.clone()), seed: args.seed };
     let mut opened = robot.open()?;
+    keeps_what_was_read(args, &opened)?;
     let session = sightings(args, &mut opened)?;
     let noise = noise(&opened.system);
     let config = CalibrationConfig { noise, ..CalibrationConfig::default() };
@@ -171,6 +174,21 @@ fn figures(calibration: &Calibration) -> Figures {
     }
 }
 
+/// Refuses to write over what was read, before anything is measured.
+fn keeps_what_was_read(args: &Calibrate, opened: &Opened) -> Result<(), Failure> {
+    let urdf = args.config.parent().unwrap_or(Path::new("")).join(&opened.config.robot);
+    let read = [args.config.as_path(), &urdf].map(std::fs::canonicalize);
+    let written = [args.out.clone(), args.out.with_extension("urdf")].map(std::fs::canonicalize);
+    let same = |w: &PathBuf| read.iter().flatten().any(|r| r == w);
+    match written.iter().flatten().find(|w| same(w)) {
+        None => Ok(()),
+        Some(path) => Err(Failure::misuse(
+            format!("{} is what the calibration starts from", path.display()),
+            "give --out another name; the robot can then be used with either",
+        )),
+    }
+}
+
 /// Writes URDF and configuration.
 fn write(args: &Calibrate, opened: &Opened, calibration: &Calibration) -> Result<(), Failure> {
     let failed = |error: &dyn std::fmt::Display| {
@@ -236,24 +254,27 @@ fn print(args: &Calibrate, outcome: &Outcome) -> Result<(), Failure> {
     if args.json {
         return crate::output::json(outcome);
     }
-    println!(
+    outln!(
         "{} places, {} and {} sightings, {} looks without the light",
-        outcome.places, outcome.sightings[0], outcome.sightings[1], outcome.missed
+        outcome.places,
+        outcome.sightings[0],
+        outcome.sightings[1],
+        outcome.missed
     );
     match (&outcome.figures, &outcome.reason) {
         (Some(figures), _) => {
-            println!("residual {:.2} px rms", figures.rms_px);
+            outln!("residual {:.2} px rms", figures.rms_px);
             for at in &figures.distance_95 {
-                println!(
+                outln!(
                     "distance {:.1} m: right to {:.1} mm with 95 % (calibration alone)",
                     at.distance,
                     1e3 * at.error
                 );
             }
-            println!("written: {0}; try `vergence find OBJECT --config {0}`", args.out.display());
+            outln!("written: {0}; try `vergence find OBJECT --config {0}`", args.out.display());
         }
         (None, reason) => {
-            println!("not calibrated: {}", reason.as_deref().unwrap_or("unknown reason"));
+            outln!("not calibrated: {}", reason.as_deref().unwrap_or("unknown reason"));
         }
     }
     Ok(())

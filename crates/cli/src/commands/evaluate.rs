@@ -14,6 +14,7 @@ use vergence_head::evaluation::{
 use vergence_head::ReaimConfig;
 
 use crate::failure::Failure;
+use crate::output::outln;
 
 /// What to evaluate.
 #[derive(ClapArgs)]
@@ -96,13 +97,13 @@ fn run_equation(json: bool) {
                 })
             })
             .collect();
-        println!("{}", json!({ "errors": rows }));
+        outln!("{}", json!({ "errors": rows }));
         return;
     }
-    println!("distance [m]  slope  bearing   error, ideal head   with lever arms");
+    outln!("distance [m]  slope  bearing   error, ideal head   with lever arms");
     let percent = |e: Option<f64>| e.map_or("none".into(), |e| format!("{:+.2} %", 100.0 * e));
     for e in errors {
-        println!(
+        outln!(
             "{:>12.1}{:>7.0}{:>9.0}{:>20}{:>18}",
             e.distance,
             e.slope.to_degrees(),
@@ -147,7 +148,7 @@ fn run_head(args: &Head) -> Result<bool, Failure> {
     }
     let timing = time_to_fixation(config.placements.min(100), config.baseline, config.seed);
     if args.json {
-        println!("{}", document(&config, &figures, &timing));
+        outln!("{}", document(&config, &figures, &timing));
     } else {
         print_table(&config, &figures, &timing);
     }
@@ -202,14 +203,17 @@ fn document(
 }
 
 fn print_table(config: &EvaluationConfig, figures: &[ServoFigures], timing: &Timing) {
-    println!(
+    outln!(
         "{} lights {} m away, baseline {} m, {} heads off by up to 3 degrees, 10 mm, 10 %",
-        config.placements, config.distance, config.baseline, config.heads
+        config.placements,
+        config.distance,
+        config.baseline,
+        config.heads
     );
-    println!("{:<38}{:>16}{:>28}", "", figures[0].kind.name, figures[1].kind.name);
+    outln!("{:<38}{:>16}{:>28}", "", figures[0].kind.name, figures[1].kind.name);
     let row = |name: &str, unit: &str, value: &dyn Fn(&ServoFigures) -> f64| {
         let label = format!("{name} [{unit}]");
-        println!("{label:<38}{:>16.2}{:>28.2}", value(&figures[0]), value(&figures[1]));
+        outln!("{label:<38}{:>16.2}{:>28.2}", value(&figures[0]), value(&figures[1]));
     };
     row("distance error before, rms", "mm", &|f| 1e3 * f.depth_rms_before);
     row("  calibrated, one fixation", "mm", &|f| 1e3 * f.depth_rms_single);
@@ -223,7 +227,7 @@ fn print_table(config: &EvaluationConfig, figures: &[ServoFigures], timing: &Tim
     let trials = format!("within the predicted 95 %, {} heads", config.trials);
     row(&trials, "%", &|f| 100.0 * f.coverage);
     row("calibrations refused", "of all", &|f| f.refused_calibrations as f64);
-    println!(
+    outln!(
         "time to fixation over (slew + code), median: {:.2} last seen within 0.1 m, {:.2} in sight, \
          {:.2} anywhere ({:.1} s)",
         timing.ratio_last_seen,

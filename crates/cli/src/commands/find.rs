@@ -6,6 +6,7 @@ use clap::{Args, ValueEnum};
 use vergence::{FindConfig, Method, Report};
 
 use crate::failure::Failure;
+use crate::output::outln;
 use crate::progress::Progress;
 use crate::robot::{Errors, RobotArgs};
 use crate::save::Saver;
@@ -59,10 +60,11 @@ pub fn run(args: &Find) -> Result<bool, Failure> {
     report.truth = robot.truth(&args.object);
     let (progress, saver) = observer;
     drop(progress);
+    // What was found is told first: it must not be lost to a full disk.
+    print(args, &report)?;
     if let Some(saver) = saver {
         saver.finish(&report)?;
     }
-    print(args, &report)?;
     Ok(report.found)
 }
 
@@ -71,34 +73,37 @@ fn print(args: &Find, report: &Report) -> Result<(), Failure> {
         return crate::output::json(report);
     }
     if let Some(reason) = &report.reason {
-        println!("{}: not found: {reason}", report.object_id);
-        println!("  what to do: {}", report.hint.unwrap_or_default());
+        outln!("{}: not found: {reason}", report.object_id);
+        outln!("  what to do: {}", report.hint.unwrap_or_default());
     }
     if let Some(landmark) = &report.landmark {
         let [x, y, z] = landmark.position;
         let sigma = [0, 4, 8].map(|k| 1e3 * landmark.covariance[k].sqrt());
-        println!(
+        outln!(
             "landmark  x {x:.4}  y {y:.4}  z {z:.4} m  (+- {:.1}, {:.1}, {:.1} mm)",
-            sigma[0], sigma[1], sigma[2]
+            sigma[0],
+            sigma[1],
+            sigma[2]
         );
     }
     if let Some(pose) = &report.pose {
         let ([x, y, z], [qx, qy, qz, qw]) = (pose.position, pose.orientation);
-        println!("position  x {x:.4}  y {y:.4}  z {z:.4} m in base");
-        println!("rotation  x {qx:.4}  y {qy:.4}  z {qz:.4}  w {qw:.4}");
-        println!("confidence {:.3}", report.confidence.unwrap_or_default());
+        outln!("position  x {x:.4}  y {y:.4}  z {z:.4} m in base");
+        outln!("rotation  x {qx:.4}  y {qy:.4}  z {qz:.4}  w {qw:.4}");
+        outln!("confidence {:.3}", report.confidence.unwrap_or_default());
     }
     if let (Some(errors), true) = (Errors::of(report), report.found) {
-        println!(
+        outln!(
             "truth     off by {:.1} mm and {:.2} degrees",
-            errors.position_mm, errors.rotation_deg
+            errors.position_mm,
+            errors.rotation_deg
         );
     }
     let took = report.timeline.last().map_or(0.0, |step| step.end);
-    println!("{took:.1} s on the robot's clock");
+    outln!("{took:.1} s on the robot's clock");
     match &args.save {
-        Some(dir) => println!("pictures and recording.mcap are in {}", dir.display()),
-        None => println!("add --save DIR for the pictures of every step and a ROS 2 recording"),
+        Some(dir) => outln!("pictures and recording.mcap are in {}", dir.display()),
+        None => outln!("add --save DIR for the pictures of every step and a ROS 2 recording"),
     }
     Ok(())
 }

@@ -6,6 +6,7 @@ use clap::Args;
 use vergence::{FindConfig, GraspConfig, Report};
 
 use crate::failure::Failure;
+use crate::output::outln;
 use crate::progress::Progress;
 use crate::robot::RobotArgs;
 use crate::save::Saver;
@@ -46,13 +47,14 @@ pub fn run(args: &Grasp) -> Result<bool, Failure> {
     }
     let (progress, saver) = observer;
     drop(progress);
-    if let (Some(saver), Some(dir)) = (saver, &args.save) {
-        robot.save_grasp(dir)?;
-        saver.finish(&report)?;
-    }
+    // What was done is told first: it must not be lost to a full disk.
     match args.json {
         true => crate::output::json(&report)?,
         false => print(&report),
+    }
+    if let (Some(saver), Some(dir)) = (saver, &args.save) {
+        robot.save_grasp(dir)?;
+        saver.finish(&report)?;
     }
     Ok(report.grasp.is_some_and(|grasp| grasp.succeeded))
 }
@@ -63,27 +65,27 @@ fn print(report: &Report) {
     let reason = report.reason.as_ref().or(grasp.reason.as_ref());
     let hint = report.hint.or(grasp.hint).unwrap_or_default();
     match (grasp.succeeded, reason) {
-        (true, _) => println!("{object}: in the hand"),
+        (true, _) => outln!("{object}: in the hand"),
         (false, reason) => {
-            println!("{object}: not grasped: {}", reason.map_or("", String::as_str));
-            println!("  what to do: {hint}");
+            outln!("{object}: not grasped: {}", reason.map_or("", String::as_str));
+            outln!("  what to do: {hint}");
         }
     }
     if let (Some(approach), Some(width), Some(force), Some(margin)) =
         (grasp.approach, grasp.width, grasp.force, grasp.margin)
     {
         let width = 1e3 * width;
-        println!("{approach} grasp, {width:.0} mm wide, {force:.0} N, margin {margin:.1}");
+        outln!("{approach} grasp, {width:.0} mm wide, {force:.0} N, margin {margin:.1}");
     }
     if let Some(shift) = grasp.corrected_by_mm {
-        println!("the second look moved it by {shift:.1} mm");
+        outln!("the second look moved it by {shift:.1} mm");
     }
     if let Some(physics) = &grasp.physics {
-        println!("the simulator says: it rose by {:.0} mm", physics.risen_mm);
+        outln!("the simulator says: it rose by {:.0} mm", physics.risen_mm);
         if let Some(collision) = &physics.collision {
-            println!("the simulator says: {collision}");
+            outln!("the simulator says: {collision}");
         }
     }
     let took = report.timeline.last().map_or(0.0, |step| step.end);
-    println!("{took:.1} s on the robot's clock");
+    outln!("{took:.1} s on the robot's clock");
 }

@@ -15,6 +15,7 @@ use vergence_sim::{WiredWorkcell, Workcell, fitting_servo};
 use crate::failure::Failure;
 use crate::interrupt::Interrupt;
 use crate::light::coordinates;
+use crate::output::outln;
 use crate::robot::RobotArgs;
 
 /// Offer the simulated workcell's devices over the wires of real ones: servos on a pseudo-terminal,
@@ -113,6 +114,7 @@ fn servo_model(
 }
 
 fn write_config(wired: &WiredWorkcell, path: &Path, urdf: &str) -> Result<(), Failure> {
+    crate::output::not_urdf(path)?;
     let robot = path.with_extension("urdf");
     let name = robot.file_name().unwrap_or_default().to_string_lossy().into_owned();
     std::fs::write(&robot, urdf).and_then(|()| std::fs::write(path, wired.wiring(&name))).map_err(
@@ -152,14 +154,14 @@ fn print(args: &Sim, wired: &WiredWorkcell) -> Result<(), Failure> {
             "config": args.write_config,
             "truth": objects,
         });
-        println!("{document}");
+        outln!("{document}");
     } else {
-        println!("servos   {port} (IDs 1 to 4: left pan, left tilt, right pan, right tilt)");
-        println!("cameras  {} {}", urls[0], urls[1]);
-        println!("tags     {tags} (HCI, H4 over TCP)");
+        outln!("servos   {port} (IDs 1 to 4: left pan, left tilt, right pan, right tilt)");
+        outln!("cameras  {} {}", urls[0], urls[1]);
+        outln!("tags     {tags} (HCI, H4 over TCP)");
         match &args.write_config {
-            Some(path) => println!("try      vergence find cup --config {}", path.display()),
-            None => println!("add --write-config FILE for a configuration that uses them"),
+            Some(path) => outln!("try      vergence find cup --config {}", path.display()),
+            None => outln!("add --write-config FILE for a configuration that uses them"),
         }
     }
     // Whoever started this waits for the line.

@@ -9,6 +9,7 @@ use vergence_devices::{DeviceError, TagAddress};
 use vergence_tag::{Pattern, Record, Shown, cbor, pattern::Bits};
 
 use crate::failure::Failure;
+use crate::output::outln;
 use crate::radio::Radio;
 use crate::robot::RobotArgs;
 use crate::signing;
@@ -146,7 +147,7 @@ fn write(args: &Write) -> Result<bool, Failure> {
         bond(&mut radio, tag, args.passkey)?;
     }
     radio.link.write_record(tag, &bytes, TIMEOUT).map_err(failed)?;
-    println!("{tag} now is \"{}\" ({} bytes)", record.object_id, bytes.len());
+    outln!("{tag} now is \"{}\" ({} bytes)", record.object_id, bytes.len());
     Ok(true)
 }
 
@@ -174,11 +175,9 @@ fn pair(args: &Pair) -> Result<bool, Failure> {
     let mut radio = args.robot.open_radio()?;
     let tag = find(&mut radio, &args.id)?;
     let kept = bond(&mut radio, tag, args.passkey)?;
-    println!("paired with {tag}");
+    outln!("paired with {tag}");
     if !kept {
-        println!(
-            "  the key is not kept: add bonds = \"tags.bonds\" to [radio] of the configuration"
-        );
+        outln!("  the key is not kept: add bonds = \"tags.bonds\" to [radio] of the configuration");
     }
     Ok(true)
 }
@@ -204,25 +203,25 @@ fn info(args: &Info) -> Result<bool, Failure> {
         crate::output::json(&output)?;
         return Ok(true);
     }
-    println!("address   {}", output.address);
-    println!("tag       {} {}", Shown(&output.manufacturer), Shown(&output.model));
-    println!("firmware  {}", Shown(&output.firmware));
-    println!("battery   {}", output.battery.map_or("unknown".into(), |b| format!("{b} %")));
-    println!("signal    {}", output.rssi.map_or("unknown".into(), |r| format!("{r} dBm")));
+    outln!("address   {}", output.address);
+    outln!("tag       {} {}", Shown(&output.manufacturer), Shown(&output.model));
+    outln!("firmware  {}", Shown(&output.firmware));
+    outln!("battery   {}", output.battery.map_or("unknown".into(), |b| format!("{b} %")));
+    outln!("signal    {}", output.rssi.map_or("unknown".into(), |r| format!("{r} dBm")));
     let record = match (output.has_record, &output.signature) {
         (false, _) => "none".into(),
         (true, Some(signature)) => format!("yes, {signature}"),
         (true, None) => "yes, not for this robot".into(),
     };
-    println!("record    {record}");
-    println!("light     {}", if output.playing { "plays" } else { "dark" });
+    outln!("record    {record}");
+    outln!("light     {}", if output.playing { "plays" } else { "dark" });
     Ok(true)
 }
 
 fn key(args: &Key) -> Result<bool, Failure> {
     let public = signing::make_key(&args.file)?;
-    println!("{} signs records (`vergence tag write --sign`); keep it secret", args.file.display());
-    println!("{} goes to the `trusted_keys` of robots", public.display());
+    outln!("{} signs records (`vergence tag write --sign`); keep it secret", args.file.display());
+    outln!("{} goes to the `trusted_keys` of robots", public.display());
     Ok(true)
 }
 

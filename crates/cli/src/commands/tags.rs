@@ -7,6 +7,7 @@ use serde::Serialize;
 use vergence_tag::{Record, Shown};
 
 use crate::failure::Failure;
+use crate::output::outln;
 use crate::radio::Radio;
 use crate::robot::RobotArgs;
 
@@ -73,11 +74,11 @@ pub fn run(args: &Tags) -> Result<bool, Failure> {
 
 fn print(tags: &[Tag]) {
     if tags.is_empty() {
-        println!("no tag answers within radio range");
-        println!("  what to do: move the robot closer, check the tags' batteries");
+        outln!("no tag answers within radio range");
+        outln!("  what to do: move the robot closer, check the tags' batteries");
         return;
     }
-    println!("{:<12} {:>5} {:>8}  {:<18} object", "id", "dBm", "battery", "address");
+    outln!("{:<12} {:>5} {:>8}  {:<18} object", "id", "dBm", "battery", "address");
     for tag in tags {
         let battery = tag.battery.map_or("?".into(), |percent| format!("{percent} %"));
         let object = match (&tag.record, &tag.error) {
@@ -94,6 +95,6 @@ fn print(tags: &[Tag]) {
             (None, error) => error.clone().unwrap_or_default(),
         };
         let id = Shown(&tag.id).to_string();
-        println!("{id:<12} {:>5} {battery:>8}  {:<18} {object}", tag.rssi, tag.address);
+        outln!("{id:<12} {:>5} {battery:>8}  {:<18} {object}", tag.rssi, tag.address);
     }
 }

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 
 use crate::failure::Failure;
+use crate::output::outln;
 
 /// Write the built-in workcell (workcell.toml, workcell.urdf) to a folder, to edit and use with
 /// --config.
@@ -32,6 +33,6 @@ pub fn run(args: &Workcell) -> Result<bool, Failure> {
     for (name, text) in files {
         std::fs::write(args.dir.join(name), text).map_err(failed)?;
     }
-    println!("{0}: try `vergence find cup --config {0}`", args.dir.join("workcell.toml").display());
+    outln!("{0}: try `vergence find cup --config {0}`", args.dir.join("workcell.toml").display());
     Ok(true)
 }

@@ -129,9 +129,10 @@ fn home(direction: usize) -> (usize, usize) {
     (steps / SLOTS, steps % SLOTS)
 }
 
-/// Nearest whole number of a value above -4096.
+/// Nearest whole number; of values beyond all pictures, one beyond them.
 fn nearest(value: f32) -> i32 {
-    (value + 4096.5) as i32 - 4096
+    const FAR: f32 = 4096.0;
+    (value.clamp(-FAR, FAR) + (FAR + 0.5)) as i32 - FAR as i32
 }
 
 impl Table {

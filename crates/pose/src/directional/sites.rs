@@ -196,7 +196,9 @@ pub fn sites(
             (Some(away), Some(up)) => away.dot(&up) < -CONTACT_COS,
             _ => false,
         };
-        let n = (length / layout.spacing_px).round().max(1.0) as usize;
+        // A contour that passes close by the camera, or is bent outwards by the lens, may be endless.
+        let across = MOST_ACROSS * (camera.width + camera.height) as f64;
+        let n = (length.min(across) / layout.spacing_px).round().max(1.0) as usize;
         for k in 0..n {
             let share = (k as f64 + 0.5) / n as f64;
             // A point of the 3D segment, and the line's direction in the picture right there:
@@ -256,6 +258,9 @@ pub fn sites(
     }
 }
 
+/// Length of a line that is followed at the spacing (sides of the picture): what is longer lies mostly
+/// outside, and is followed in larger steps.
+const MOST_ACROSS: f64 = 3.0;
 /// Share of the spacing that sites keep at least.
 const LEAST_SPACING: f64 = 0.5;
 /// Cosine above which a face that turns away counts as the one that the object rests on.

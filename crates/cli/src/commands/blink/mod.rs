@@ -18,6 +18,7 @@ use vergence_ros::recording::{self, RecordingError};
 use self::report::Report;
 use self::request::BlinkRequest;
 use crate::failure::Failure;
+use crate::output::{out, outln};
 
 /// How the landmarks are looked for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -68,9 +69,9 @@ pub fn run(args: Args) -> Result<bool, Failure> {
     if args.bound {
         let bound = bound::run(args.runs, args.minutes)?;
         if args.json {
-            println!("{}", serde_json::to_string_pretty(&bound).unwrap_or_default());
+            outln!("{}", serde_json::to_string_pretty(&bound).unwrap_or_default());
         } else {
-            print!("{}", bound.text());
+            out!("{}", bound.text());
         }
         return Ok(true);
     }
@@ -85,9 +86,9 @@ pub fn run(args: Args) -> Result<bool, Failure> {
         write(out, &report.json())?;
     }
     if args.json {
-        println!("{}", report.json());
+        outln!("{}", report.json());
     } else {
-        print!("{}", report.text());
+        out!("{}", report.text());
     }
     Ok(report.is_complete())
 }
@@ -113,7 +114,7 @@ fn run_set(set: &Path, out: &Path, method: Method) -> Result<bool, Failure> {
         let report = look(&recording, &request, method, None)?;
         let name = episode.file_name().unwrap_or_default().to_string_lossy().into_owned();
         eprintln!("{name}: {}", report.line());
-        write(&out.join(name).with_extension("json"), &report.json())?;
+        write(&out.join(format!("{name}.json")), &report.json())?;
     }
     Ok(true)
 }

@@ -17,6 +17,7 @@ use vergence_sim::{Scenario, stereo_scene};
 
 use crate::commands::pose::{Method, pool, set};
 use crate::failure::Failure;
+use crate::output::outln;
 
 /// Recognise objects in simulated stereo pairs, or in a pose set, and compare with the truth.
 #[derive(Args)]
@@ -78,7 +79,7 @@ pub fn run(args: &Pose) -> Result<bool, Failure> {
     });
     let figures = Figures::of(&outcomes?);
     if args.json {
-        println!("{}", figures.document(args));
+        outln!("{}", figures.document(args));
     } else {
         figures.print(args);
     }
@@ -126,6 +127,7 @@ fn recognise(
         Ok(found) => Outcome::Answer(Answer::new(scene, &found, truth)),
         Err(refusal) => Outcome::Refused(match refusal {
             Refusal::Ambiguous { .. } => "another pose explains the edges about as well",
+            Refusal::Chance { .. } => "the edges fit little better than chance would",
             Refusal::TooFewEdges { .. } => "too little of the contour lies on edges",
             _ => "the scene could not be worked on",
         }),
@@ -229,27 +231,28 @@ impl Figures {
 
     fn print(&self, args: &Pose) {
         match &args.set {
-            Some(set) => println!("{} scenes of {}", self.scenes, set.display()),
-            None => println!("{} simulated stereo scenes from seed {}", self.scenes, args.seed),
+            Some(set) => outln!("{} scenes of {}", self.scenes, set.display()),
+            None => outln!("{} simulated stereo scenes from seed {}", self.scenes, args.seed),
         }
-        println!("answered                          {}", self.answered);
-        println!("within 5 mm, 5 deg (of all)       {:.3}", self.within_5);
-        println!("within 2 mm, 2 deg (of all)       {:.3}", self.within_2);
-        println!(
+        outln!("answered                          {}", self.answered);
+        outln!("within 5 mm, 5 deg (of all)       {:.3}", self.within_5);
+        outln!("within 2 mm, 2 deg (of all)       {:.3}", self.within_2);
+        outln!(
             "median error (of all)             {:.2} mm, {:.2} deg",
-            self.median_mm, self.median_deg
+            self.median_mm,
+            self.median_deg
         );
-        println!(
+        outln!(
             "answers beyond 10 mm or 5 deg     {} {}",
             self.wrong.len(),
             if self.wrong.is_empty() { String::new() } else { format!("{:?}", self.wrong) }
         );
-        println!("95 % ellipsoid holds the truth    {:.3} of the answers", self.held);
-        println!("squared error over its freedoms   {:.2} median", self.nees);
+        outln!("95 % ellipsoid holds the truth    {:.3} of the answers", self.held);
+        outln!("squared error over its freedoms   {:.2} median", self.nees);
         for (why, count) in &self.refused {
-            println!("refused: {why}: {count}");
+            outln!("refused: {why}: {count}");
         }
-        println!("time                              {:.1} ms median", self.median_ms);
+        outln!("time                              {:.1} ms median", self.median_ms);
     }
 }
 

@@ -12,6 +12,7 @@ use vergence_sim::Scenario;
 use super::{Experiment, quantile};
 use crate::commands::find::MethodArg;
 use crate::failure::Failure;
+use crate::output::outln;
 use crate::progress::Progress;
 use crate::robot::{Errors, Opened};
 use crate::save::Saver;
@@ -166,7 +167,7 @@ fn print(args: &Experiment, output: &Output) {
         let grasp = run.report.grasp.as_ref();
         let said = if run.grasped() { "grasped" } else { "not grasped" };
         let physics = run.physics();
-        println!(
+        outln!(
             "seed {:>3}  {:<11}  {:<5}  rose {:>5} mm, closing shifted it {:>4} mm, {:>5} s{}{}{}",
             run.seed,
             said,
@@ -179,7 +180,7 @@ fn print(args: &Experiment, output: &Output) {
             run.reason.as_ref().map_or("".into(), |r| format!(": {r}")),
         );
     }
-    println!(
+    outln!(
         "experiment 2, {} seeds: {} grasped by the robot's word, {} lifted by the physics' \
          ({} false successes), {} collisions, {} refused",
         output.seeds,
@@ -189,7 +190,7 @@ fn print(args: &Experiment, output: &Output) {
         output.collisions,
         output.refused
     );
-    println!(
+    outln!(
         "found after {} s, in the hand after {} s (median; p90 {} s); pose off by {} mm, \
          second look moved the grasp by {} mm, closing shifted the cup by {} mm (p90 {} mm)",
         number(output.find_seconds_median),
@@ -201,6 +202,6 @@ fn print(args: &Experiment, output: &Output) {
         number(output.closing_error_p90_mm)
     );
     if let Some(dir) = &args.save {
-        println!("pictures and recordings are in {}", dir.display());
+        outln!("pictures and recordings are in {}", dir.display());
     }
 }

@@ -11,6 +11,7 @@ use vergence_sim::Scenario;
 use super::{Experiment, quantile};
 use crate::commands::find::MethodArg;
 use crate::failure::Failure;
+use crate::output::outln;
 use crate::progress::Progress;
 use crate::robot::{Errors, Opened};
 use crate::save::Saver;
@@ -159,8 +160,8 @@ fn landmark_error_mm(report: &Report) -> Option<f64> {
 }
 
 fn print(args: &Experiment, output: &Output) {
-    println!("experiment 1, method {}, {} seeds", output.method, output.seeds);
-    println!(
+    outln!("experiment 1, method {}, {} seeds", output.method, output.seeds);
+    outln!(
         "{:<14} {:>5} {:>6} {:>6} {:>6} {:>9} {:>8} {:>9} {:>8} {:>12} {:>8}",
         "condition",
         "runs",
@@ -176,7 +177,7 @@ fn print(args: &Experiment, output: &Output) {
     );
     let number = |value: Option<f64>| value.map_or("-".into(), |v| format!("{v:.2}"));
     for c in &output.conditions {
-        println!(
+        outln!(
             "{:<14} {:>5} {:>6} {:>6} {:>6} {:>9} {:>8} {:>9} {:>8} {:>12} {:>8}",
             c.condition,
             c.runs,
@@ -193,11 +194,11 @@ fn print(args: &Experiment, output: &Output) {
     }
     for c in &output.conditions {
         for reason in &c.reasons {
-            println!("  {}, {reason}", c.condition);
+            outln!("  {}, {reason}", c.condition);
         }
     }
-    println!("right: within {RIGHT_MM} mm and {RIGHT_DEG} degrees of the simulator's truth");
+    outln!("right: within {RIGHT_MM} mm and {RIGHT_DEG} degrees of the simulator's truth");
     if let Some(dir) = &args.save {
-        println!("pictures are in {}", dir.display());
+        outln!("pictures are in {}", dir.display());
     }
 }
