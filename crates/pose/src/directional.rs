@@ -107,7 +107,7 @@ impl Default for Config {
             grazing: 0.1,
             distinct: 2f64.to_radians(),
             different: 12f64.to_radians(),
-            least_coverage: 0.5,
+            least_coverage: 0.55,
             least_evidence: 2.2,
             least_confidence: 0.9,
             most_turn: 15f64.to_radians(),
