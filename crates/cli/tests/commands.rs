@@ -151,6 +151,24 @@ fn a_user_edits_the_workcell() {
     }
 }
 
+/// More than the air holds: such a tag is known by its record.
+#[test]
+fn an_object_with_a_long_id_is_found() {
+    let dir = folder("long-id");
+    assert_eq!(vergence(&["workcell", dir.to_str().unwrap()]).status.code(), Some(0));
+    let path = dir.join("workcell.toml");
+    let text = std::fs::read_to_string(&path).unwrap();
+    let (id, other) = ("left-kitchen-drawer-cup", "left-kitchen-drawer-mug");
+    let long = text.replacen("object_id = \"cup\"", &format!("object_id = \"{id}\""), 1);
+    assert_ne!(long, text);
+    std::fs::write(&path, long).unwrap();
+    let find = |id| vergence(&["find", id, "--config", path.to_str().unwrap(), "--json"]);
+    assert_eq!(json(&find(id))["found"], true);
+    let wrong = find(other);
+    assert_eq!(wrong.status.code(), Some(1));
+    assert!(json(&wrong)["reason"].as_str().unwrap().contains(id), "{}", json(&wrong));
+}
+
 /// Output that nobody wants to read on, and output that cannot be kept.
 #[cfg(target_os = "linux")]
 #[test]

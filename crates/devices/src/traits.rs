@@ -121,12 +121,19 @@ impl fmt::Display for TagAddress {
 pub struct Advertisement {
     /// Who sent it.
     pub address: TagAddress,
-    /// The object id that it claims; the record may say otherwise.
+    /// The object id that it claims, or the beginning of a long one; the record may say otherwise.
     pub object_id: String,
     /// Received signal strength (dBm).
     pub rssi: i8,
     /// Battery level (percent), when it tells.
     pub battery: Option<u8>,
+}
+
+impl Advertisement {
+    /// It may be the tag of this object: a long id is advertised by its beginning only.
+    pub fn may_be(&self, object_id: &str) -> bool {
+        vergence_tag::beacon::may_be(&self.object_id, object_id)
+    }
 }
 
 /// What the LED is told.

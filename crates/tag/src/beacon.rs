@@ -140,10 +140,20 @@ impl Beacon {
     pub fn object_id(&self) -> Option<&str> {
         let name = self.name.as_deref()?;
         let whole = self.short_id.is_none_or(|id| id == short_id(name));
-        // A name of full length may be the beginning of a longer one, whose hash is another.
-        let cut = name.len() + 4 > MAX_NAME;
-        (whole || cut).then_some(name)
+        // The hash of a name that was cut is another.
+        (whole || may_be_cut(name)).then_some(name)
     }
+}
+
+/// A name of full length may be the beginning of a longer one; a character has up to four bytes.
+fn may_be_cut(name: &str) -> bool {
+    name.len() + 4 > MAX_NAME
+}
+
+/// What is advertised under this name may be this object: of a long id only the beginning fits the
+/// air, so that no more than the record can tell.
+pub fn may_be(name: &str, object_id: &str) -> bool {
+    name == object_id || may_be_cut(name) && object_id.starts_with(name)
 }
 
 #[cfg(test)]
@@ -164,6 +174,8 @@ mod tests {
             beacon.hear(&second);
             prop_assert_eq!(beacon.short_id, Some(short_id(&id)));
             let name = beacon.object_id().unwrap();
+            prop_assert!(may_be(name, &id));
+            prop_assert!(!may_be("cup", "cupboard"));
             prop_assert!(id.starts_with(name) && (name.len() == id.len() || name.len() > MAX_NAME - 4));
             prop_assert_eq!((beacon.battery, beacon.playing), (battery, Some(playing)));
         }

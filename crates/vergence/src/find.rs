@@ -138,7 +138,9 @@ impl Stop {
                 "move the robot closer, check the tag's battery and the spelling; `vergence tags` lists who answers"
             }
             Stop::Ambiguous { .. } => "switch one of the tags off, or write another id to it",
-            Stop::Record(_) | Stop::WrongRecord { .. } => "write a correct record to the tag",
+            Stop::Record(_) | Stop::WrongRecord { .. } => {
+                "write a correct record to the tag; `vergence tags` lists what each one is"
+            }
             Stop::Signature(_) => {
                 "this robot wants records that are signed by a key of `trusted_keys`: `vergence tag write --sign`"
             }
@@ -258,7 +260,7 @@ impl Run<'_> {
     /// All steps of a find.
     pub(crate) fn all(&mut self, object: &str) -> Result<Found, Stop> {
         let tag = self.step("radio", |run| run.radio(object))?;
-        let record = self.step("record", |run| run.record(&tag))?;
+        let record = self.step("record", |run| run.record(&tag, object))?;
         let pattern = self.step("blink", |run| run.start_blinking(tag.address, 0))?;
         let landmark = self.locate(tag.address, pattern);
         // The light must go out whether or not it was seen: for the pictures, and for the battery.
@@ -347,7 +349,7 @@ impl Run<'_> {
         let heard = self.system.robot.radio.scan(self.config.scan_window)?;
         self.observer.notice(&Event::Heard(&heard));
         self.heard.clone_from(&heard);
-        let mut wanted = heard.iter().filter(|tag| tag.object_id == object);
+        let mut wanted = heard.iter().filter(|tag| tag.may_be(object));
         match (wanted.next(), wanted.count()) {
             (Some(tag), 0) => Ok(tag.clone()),
             (Some(_), others) => Err(Stop::Ambiguous { object: object.into(), count: others + 1 }),
@@ -355,8 +357,8 @@ impl Run<'_> {
         }
     }
 
-    /// The object's record, checked against what the tag advertised.
-    pub(crate) fn record(&mut self, tag: &Advertisement) -> Result<Record, Stop> {
+    /// The object's record, which has to be of the wanted object.
+    pub(crate) fn record(&mut self, tag: &Advertisement, object: &str) -> Result<Record, Stop> {
         let timeout = self.config.link_timeout;
         let bytes = self.retry(|radio| radio.read_record(tag.address, timeout))?;
         let verdict = self.system.required_signers.as_ref().map(|keys| keys.judge(&bytes));
@@ -364,7 +366,7 @@ impl Run<'_> {
             return Err(Stop::Signature(verdict));
         }
         let record = vergence_tag::cbor::decode(&bytes)?;
-        if record.object_id.as_str() != tag.object_id {
+        if record.object_id.as_str() != object {
             let (advertised, recorded) = (tag.object_id.clone(), record.object_id.to_string());
             return Err(Stop::WrongRecord { advertised, recorded });
         }

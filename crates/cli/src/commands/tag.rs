@@ -248,7 +248,7 @@ fn find(radio: &mut Radio, id: &str) -> Result<TagAddress, Failure> {
         return Ok(tag);
     }
     let tags: Vec<TagAddress> =
-        heard.iter().filter(|tag| tag.object_id == id).map(|tag| tag.address).collect();
+        heard.iter().filter(|tag| tag.may_be(id)).map(|tag| tag.address).collect();
     match tags[..] {
         [tag] => Ok(tag),
         [] => {

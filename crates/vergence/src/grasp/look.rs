@@ -40,12 +40,12 @@ impl Run<'_> {
         joints: &JointAngles,
         found: &Found,
     ) -> Result<HandSight, Stop> {
-        let tag = self.heard.iter().find(|tag| tag.object_id == light.object_id).cloned();
+        let tag = self.heard.iter().find(|tag| tag.may_be(&light.object_id)).cloned();
         let tag = tag.ok_or_else(|| Stop::OutOfRange {
             object: light.object_id.clone(),
             heard: names(&self.heard),
         })?;
-        let record = self.record(&tag)?;
+        let record = self.record(&tag, &light.object_id)?;
         let base_from_tag = light.chain.forward(joints);
         let object = found.landmark.position;
         // The light that shines most towards the heads.
