@@ -2,7 +2,6 @@
 
 use std::fmt::Arguments;
 use std::io::{ErrorKind, Write};
-use std::path::Path;
 
 use serde::Serialize;
 
@@ -43,15 +42,4 @@ pub fn write(text: Arguments) {
     );
     eprintln!("{failure}");
     std::process::exit(failure.status.into());
-}
-
-/// Refuses a name for a configuration whose URDF, beside it, would have the same.
-pub fn not_urdf(path: &Path) -> Result<(), Failure> {
-    if path.extension().is_none_or(|extension| extension != "urdf") {
-        return Ok(());
-    }
-    Err(Failure::misuse(
-        format!("{} would be both the configuration and its URDF", path.display()),
-        "name the configuration FILE.toml; its URDF goes beside it",
-    ))
 }

@@ -236,7 +236,7 @@ impl Errors {
 /// Reads the configuration and the description that it names.
 fn read(path: &Path) -> Result<(Config, Description), Failure> {
     let config = Config::read(path).map_err(unusable)?;
-    let urdf = folder(path).join(&config.robot);
+    let urdf = urdf(path, &config);
     let text = std::fs::read_to_string(&urdf).map_err(|error| {
         Failure::misuse(
             format!("cannot read {}: {error}", urdf.display()),
@@ -245,6 +245,22 @@ fn read(path: &Path) -> Result<(Config, Description), Failure> {
     })?;
     let description = Description::parse(&text, &urdf).map_err(unusable)?;
     Ok((config, description))
+}
+
+/// Where the URDF is that the configuration at this path names.
+pub fn urdf(path: &Path, config: &Config) -> PathBuf {
+    folder(path).join(&config.robot)
+}
+
+/// Refuses a name for a configuration whose URDF, beside it, would have the same.
+pub fn not_urdf(path: &Path) -> Result<(), Failure> {
+    if path.extension().is_none_or(|extension| extension != "urdf") {
+        return Ok(());
+    }
+    Err(Failure::misuse(
+        format!("{} would be both the configuration and its URDF", path.display()),
+        "name the configuration FILE.toml; its URDF goes beside it",
+    ))
 }
 
 /// The folder that a configuration's paths are relative to.

@@ -10,7 +10,7 @@ use nalgebra::{Translation3, Vector3};
 use vergence_devices::{Arm, Execution, GripCommand, MotionLimits};
 use vergence_geometry::{Solid, Trajectory, Transform, Waypoint};
 use vergence_grasp::object::Placed;
-use vergence_grasp::{Config, Obstacle};
+use vergence_grasp::{Config, Obstacle, Plan};
 use vergence_physics::experiment::{self, Cell, Conditions, HOME, table};
 use vergence_physics::trial::{self, Verdict};
 use vergence_physics::{PhysicsArm, TrueObject};
@@ -85,11 +85,10 @@ fn a_pose_45_mm_off_is_not_lifted() {
     }
 }
 
-#[test]
-fn occupied_space_is_felt_and_the_arm_stops() {
+/// Something that the planner was not told of stands on the way of the approach.
+fn with_a_shelf() -> (PhysicsArm, Plan) {
     let planned = trial(2, |_| ());
     let plan = planned.plan.unwrap();
-    // Something that the planner was not told of stands on the way of the approach.
     let mut obstacles = planned.obstacles.clone();
     let at = plan.base_from_tip.translation.vector + Vector3::z() * 0.06;
     obstacles.push(Obstacle {
@@ -98,7 +97,12 @@ fn occupied_space_is_felt_and_the_arm_stops() {
         solid: Solid::Cuboid { half: Vector3::new(0.2, 0.2, 0.005) },
     });
     let world = cell().world(&HOME, &obstacles, &planned.object).unwrap();
-    let mut arm = PhysicsArm::new(Arc::new(Mutex::new(world)), None);
+    (PhysicsArm::new(Arc::new(Mutex::new(world)), None), plan)
+}
+
+#[test]
+fn occupied_space_is_felt_and_the_arm_stops() {
+    let (mut arm, plan) = with_a_shelf();
     let verdict = trial::run(&mut arm, &plan).unwrap();
     assert!(!verdict.succeeded);
     assert_eq!(verdict.collision.unwrap().other, "shelf");
@@ -106,17 +110,7 @@ fn occupied_space_is_felt_and_the_arm_stops() {
 
 #[test]
 fn a_motion_does_not_report_what_an_earlier_one_has_touched() {
-    let planned = trial(2, |_| ());
-    let plan = planned.plan.unwrap();
-    let mut obstacles = planned.obstacles.clone();
-    let at = plan.base_from_tip.translation.vector + Vector3::z() * 0.06;
-    obstacles.push(Obstacle {
-        name: "shelf".into(),
-        base_from_solid: Translation3::from(at).into(),
-        solid: Solid::Cuboid { half: Vector3::new(0.2, 0.2, 0.005) },
-    });
-    let world = cell().world(&HOME, &obstacles, &planned.object).unwrap();
-    let mut arm = PhysicsArm::new(Arc::new(Mutex::new(world)), None);
+    let (mut arm, plan) = with_a_shelf();
     trial::to_pregrasp(&mut arm, &plan).unwrap();
     let watched = MotionLimits::default();
     let outcome = arm.execute(&plan.approach, &watched).unwrap();

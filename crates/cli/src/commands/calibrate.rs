@@ -14,7 +14,7 @@ use crate::failure::Failure;
 use crate::light::{Person, Ruler, SimulatedPerson};
 use crate::output::outln;
 use crate::progress::Progress;
-use crate::robot::{BUILT, Opened, RobotArgs};
+use crate::robot::{BUILT, Opened, RobotArgs, not_urdf, urdf};
 
 /// Calibrate both heads from a tag's blinking light: joint zeros, axes, lever arms, lenses. The tag is
 /// moved from place to place; every second place is a known length from the one before.
@@ -101,7 +101,7 @@ pub fn run(args: &Calibrate) -> Result<bool, Failure> {
             "give them in metres, for example --length 0.5 --length-sigma 0.0005",
         ));
     }
-    crate::output::not_urdf(&args.out)?;
+    not_urdf(&args.out)?;
     let robot = RobotArgs { config: Some(args.config.clone()), seed: args.seed };
     let mut opened = robot.open()?;
     keeps_what_was_read(args, &opened)?;
@@ -176,7 +176,7 @@ fn figures(calibration: &Calibration) -> Figures {
 
 /// Refuses to write over what was read, before anything is measured.
 fn keeps_what_was_read(args: &Calibrate, opened: &Opened) -> Result<(), Failure> {
-    let urdf = args.config.parent().unwrap_or(Path::new("")).join(&opened.config.robot);
+    let urdf = urdf(&args.config, &opened.config);
     let read = [args.config.as_path(), &urdf].map(std::fs::canonicalize);
     let written = [args.out.clone(), args.out.with_extension("urdf")].map(std::fs::canonicalize);
     let same = |w: &PathBuf| read.iter().flatten().any(|r| r == w);

@@ -114,7 +114,7 @@ fn servo_model(
 }
 
 fn write_config(wired: &WiredWorkcell, path: &Path, urdf: &str) -> Result<(), Failure> {
-    crate::output::not_urdf(path)?;
+    crate::robot::not_urdf(path)?;
     let robot = path.with_extension("urdf");
     let name = robot.file_name().unwrap_or_default().to_string_lossy().into_owned();
     std::fs::write(&robot, urdf).and_then(|()| std::fs::write(path, wired.wiring(&name))).map_err(

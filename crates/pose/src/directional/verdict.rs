@@ -101,16 +101,7 @@ fn part_evidence(part: &[Site], sd_px: f64, density: f64) -> f64 {
             let outer = likelihoods(site, 0.0, sd_px, scale);
             let inner = site.inner.map(|place| (place, likelihoods(site, place, sd_px, scale)));
             for (product, shows) in product.iter_mut().zip(shows) {
-                let mut edge = outer.map(|side| side.map(|l| shows[0] * l));
-                if let Some((place, inner)) = &inner {
-                    // Edges too close to be two must not count twice.
-                    let same = (-0.25 * (place / sd_px).powi(2)).exp();
-                    let share = shows[1] * (1.0 - same * shows[0].min(shows[1]));
-                    for (edge, l) in edge.iter_mut().flatten().zip(inner.iter().flatten()) {
-                        *edge += share * l;
-                    }
-                }
-                let [dark, bright] = edge;
+                let [dark, bright] = shown(&outer, inner.as_ref(), shows, sd_px);
                 for j in 0..GRID {
                     let (a, b) = (bright[j], dark[j]);
                     product[0][j] *= missing + 2.0 * (a + WRONG_SIDE * (b - a));
@@ -137,9 +128,31 @@ fn part_evidence(part: &[Site], sd_px: f64, density: f64) -> f64 {
     worth * most + (total / priors).ln()
 }
 
+/// By bright side and for every offset of the grid.
+type Likelihoods = [[f64; GRID]; 2];
+
+/// Likelihoods of a lip's outer edge and, with its place (px), of the inner, as often as either shows.
+fn shown(
+    outer: &Likelihoods,
+    inner: Option<&(f64, Likelihoods)>,
+    shows: &[f64; 2],
+    sd_px: f64,
+) -> Likelihoods {
+    let mut edge = outer.map(|side| side.map(|l| shows[0] * l));
+    if let Some((place, inner)) = inner {
+        // Edges too close to be two must not count twice.
+        let same = (-0.25 * (place / sd_px).powi(2)).exp();
+        let share = shows[1] * (1.0 - same * shows[0].min(shows[1]));
+        for (edge, l) in edge.iter_mut().flatten().zip(inner.iter().flatten()) {
+            *edge += share * l;
+        }
+    }
+    edge
+}
+
 /// How likely the edges of a site are for a contour at this place (px along the normal), those brighter
 /// inside and those brighter outside, for every offset of the grid; all times `scale`.
-fn likelihoods(site: &Site, place: f64, sd_px: f64, scale: f64) -> [[f64; GRID]; 2] {
+fn likelihoods(site: &Site, place: f64, sd_px: f64, scale: f64) -> Likelihoods {
     let mut sums = [[0.0; GRID]; 2];
     let common = site.offset_sd() * site.px_per_metre;
     let local = sd_px.powi(2) + (BENT * common).powi(2);
