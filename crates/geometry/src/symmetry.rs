@@ -4,11 +4,11 @@ use nalgebra::{UnitQuaternion, Vector3};
 
 use crate::Transform;
 
-/// The rotations of the object frame that map the object onto itself.
+/// The motions of the object frame that map the object onto itself.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Symmetry {
-    /// A finite set, the identity included.
-    Finite(Vec<UnitQuaternion<f64>>),
+    /// A finite set, the identity included: turns about axes that need not pass the frame's origin.
+    Finite(Vec<Transform>),
     /// Any turn about the object's z axis; when `flip`, also upside down.
     Revolution {
         /// Top and bottom are alike.
@@ -21,38 +21,14 @@ pub enum Symmetry {
 impl Symmetry {
     /// No symmetry but the identity.
     pub fn none() -> Self {
-        Symmetry::Finite(vec![UnitQuaternion::identity()])
-    }
-
-    /// The rotations of a box of these sides (m) onto itself; sides that differ by less than
-    /// `tolerance` count as equal.
-    pub fn of_box(sides: [f64; 3], tolerance: f64) -> Self {
-        let mut rotations: Vec<UnitQuaternion<f64>> = Vec::new();
-        let permutations = [[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]];
-        for p in permutations {
-            if (0..3).any(|k| (sides[p[k]] - sides[k]).abs() > tolerance) {
-                continue;
-            }
-            for signs in 0..8u8 {
-                let mut m = nalgebra::Matrix3::zeros();
-                for k in 0..3 {
-                    m[(k, p[k])] = if signs >> k & 1 == 0 { 1.0 } else { -1.0 };
-                }
-                if m.determinant() > 0.0 {
-                    let rotation = nalgebra::Rotation3::from_matrix_unchecked(m);
-                    rotations.push(UnitQuaternion::from_rotation_matrix(&rotation));
-                }
-            }
-        }
-        rotations.sort_by(|a, b| a.angle().total_cmp(&b.angle()));
-        Symmetry::Finite(rotations)
+        Symmetry::Finite(vec![Transform::identity()])
     }
 
     /// Smallest rotation angle (rad) between two attitudes when symmetric ones count as equal.
     pub fn angle_between(&self, a: &UnitQuaternion<f64>, b: &UnitQuaternion<f64>) -> f64 {
         match self {
-            Symmetry::Finite(rotations) => {
-                rotations.iter().map(|s| a.angle_to(&(b * s))).fold(f64::INFINITY, f64::min)
+            Symmetry::Finite(motions) => {
+                motions.iter().map(|s| a.angle_to(&(b * s.rotation))).fold(f64::INFINITY, f64::min)
             }
             Symmetry::Revolution { flip } => {
                 let cos = (a * Vector3::z()).dot(&(b * Vector3::z()));
@@ -68,11 +44,11 @@ impl Symmetry {
     pub fn nearest(&self, pose: &Transform, reference: &Transform) -> Transform {
         let (a, b) = (pose.rotation, reference.rotation);
         let rotation = match self {
-            Symmetry::Finite(rotations) => rotations
-                .iter()
-                .map(|s| a * s)
-                .min_by(|x, y| x.angle_to(&b).total_cmp(&y.angle_to(&b)))
-                .unwrap_or(a),
+            Symmetry::Finite(motions) => {
+                let off = |p: &Transform| p.rotation.angle_to(&b);
+                let twins = motions.iter().map(|s| pose * s);
+                return twins.min_by(|x, y| off(x).total_cmp(&off(y))).unwrap_or(*pose);
+            }
             Symmetry::Revolution { flip } => {
                 let axis = a * Vector3::z();
                 let wanted = b * Vector3::z();
@@ -90,17 +66,6 @@ mod tests {
     use super::*;
 
     #[test]
-    fn boxes_have_four_eight_and_twenty_four_rotations() {
-        let count = |sides| match Symmetry::of_box(sides, 1e-4) {
-            Symmetry::Finite(r) => r.len(),
-            _ => 0,
-        };
-        assert_eq!(count([0.1, 0.2, 0.3]), 4);
-        assert_eq!(count([0.1, 0.1, 0.3]), 8);
-        assert_eq!(count([0.1, 0.1, 0.1]), 24);
-    }
-
-    #[test]
     fn a_turn_about_the_axis_does_not_count() {
         let a = UnitQuaternion::from_euler_angles(0.2, 0.3, 0.4);
         let turned = a * UnitQuaternion::from_euler_angles(0.0, 0.0, 1.0);
@@ -111,5 +76,20 @@ mod tests {
         let pose = |rotation| Transform::from_parts(Default::default(), rotation);
         let near = Symmetry::Revolution { flip: true }.nearest(&pose(flipped), &pose(turned));
         assert!(near.rotation.angle_to(&turned) < 1e-6);
+    }
+
+    #[test]
+    fn an_axis_beside_the_origin_takes_the_origin_along() {
+        // Half a turn about the vertical through (1, 0, 0).
+        let half = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), std::f64::consts::PI);
+        let swap = Transform::from_parts(Vector3::new(2.0, 0.0, 0.0).into(), half);
+        let symmetry = Symmetry::Finite(vec![Transform::identity(), swap]);
+        let pose = Transform::from_parts(
+            Vector3::new(0.3, 0.2, 0.1).into(),
+            UnitQuaternion::from_euler_angles(0.2, 0.3, 0.4),
+        );
+        let near = symmetry.nearest(&(pose * swap), &pose);
+        assert!((near.translation.vector - pose.translation.vector).norm() < 1e-12);
+        assert!(near.rotation.angle_to(&pose.rotation) < 1e-6);
     }
 }

@@ -78,7 +78,8 @@ pub struct Config {
     pub grazing: f64,
     /// Roughly refined poses nearer than this (rad) are one: the finer refinement joins them.
     pub distinct: f64,
-    /// Poses that differ by more than this turn (rad) count as different in the verdict.
+    /// Poses that differ by more than this turn (rad), or are as far apart as a turn by this about the
+    /// object's middle moves its furthest corner, count as different in the verdict.
     pub different: f64,
     /// Share of the contour that must lie on edges.
     pub least_coverage: f64,
@@ -144,7 +145,8 @@ pub fn recognise_traced<'a>(
     if sights.is_empty() {
         return Err(Refusal::OutOfView);
     }
-    let search = Search { sights: &sights, model: &model, query, landmark, normal, config };
+    let symmetry = query.symmetry();
+    let search = Search { sights: &sights, model: &model, query, symmetry, landmark, normal, config };
     let hypotheses = search.hypotheses();
     let rough = hypotheses.iter().map(|h| search.refine_roughly(&h.pose, h.rests)).collect();
     let rough = search.ranked(rough, config.distinct);
@@ -178,12 +180,13 @@ pub fn track(
     if sights.is_empty() {
         return Err(Refusal::OutOfView);
     }
-    let search = Search { sights: &sights, model: &model, query, landmark, normal, config };
+    let symmetry = query.symmetry();
+    let search = Search { sights: &sights, model: &model, query, symmetry, landmark, normal, config };
     let (rough, _) = search.refine_roughly(last, false);
     let (mut refined, explained) = search.refine_finely(rough);
     search.doubt(&mut refined, &FINAL);
     let found = search.verdict(&[(refined, explained)])?;
-    let turned = query.symmetry().angle_between(&found.pose.pose.rotation, &last.rotation);
+    let turned = search.symmetry.angle_between(&found.pose.pose.rotation, &last.rotation);
     if turned > config.most_turn {
         return Err(Refusal::Lost { turned_deg: turned.to_degrees(), best: Box::new(found) });
     }
@@ -335,6 +338,15 @@ impl Search<'_> {
         (refined, explained)
     }
 
+    /// How different two poses are (rad): by how much they are turned against each other, or by how
+    /// far the object is off, seen from as far away as it reaches. Of symmetric twins the nearest.
+    fn between(&self, a: &Transform, b: &Transform) -> f64 {
+        let near = self.symmetry.nearest(b, a);
+        let reach = 0.5 * Vector3::from(self.query.record.bounding_box.sides()).norm();
+        let off = (near.translation.vector - a.translation.vector).norm();
+        a.rotation.angle_to(&near.rotation).max(off / reach)
+    }
+
     /// Best first, without those less than `apart` (rad) from a better one.
     fn ranked(
         &self,
@@ -342,12 +354,10 @@ impl Search<'_> {
         apart: f64,
     ) -> Vec<(Refined, Explained)> {
         found.sort_by(|a, b| b.1.evidence.total_cmp(&a.1.evidence));
-        let symmetry = self.query.symmetry();
         let mut kept: Vec<(Refined, Explained)> = Vec::new();
         for candidate in found {
-            let turn = &candidate.0.pose.rotation;
-            let away =
-                |k: &(Refined, Explained)| symmetry.angle_between(&k.0.pose.rotation, turn) > apart;
+            let pose = &candidate.0.pose;
+            let away = |k: &(Refined, Explained)| self.between(&k.0.pose, pose) > apart;
             if kept.iter().all(away) {
                 kept.push(candidate);
             }
@@ -358,16 +368,15 @@ impl Search<'_> {
     /// Poses whose contour is the same but for the tolerance of form, refined on their own: little
     /// but the landmark's place tells them apart.
     fn twins(&self, of: &Refined) -> Vec<(Refined, Explained)> {
-        let known = self.query.symmetry();
         let stands = |p: &Transform| {
             let up = self.query.up.map_or(0.0, |up| (p.rotation * Vector3::z()).dot(&up));
             self.query.standing != Some(true) || up > 0.0
         };
         self.query
-            .near_symmetries()
+            .near_symmetries(self.model)
             .into_iter()
-            .map(|s| Transform::from_parts(of.pose.translation, of.pose.rotation * s))
-            .filter(|p| known.angle_between(&p.rotation, &of.pose.rotation) > self.config.different)
+            .map(|s| of.pose * s)
+            .filter(|p| self.between(p, &of.pose) > self.config.different)
             .filter(stands)
             .map(|pose| {
                 let mut twin = Refined { pose, ..of.without_sites() };
@@ -395,7 +404,7 @@ impl Search<'_> {
             confidence: 1.0 / total,
             coverage: explained.coverage,
             alternatives,
-            symmetry: self.query.symmetry(),
+            symmetry: self.symmetry.clone(),
         };
         if !(found.coverage >= self.config.least_coverage) {
             return Err(Refusal::TooFewEdges { best: Box::new(found) });

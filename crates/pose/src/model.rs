@@ -12,7 +12,8 @@
 mod polyhedron;
 mod revolution;
 
-use nalgebra::Vector3;
+use nalgebra::{Matrix3, Vector3};
+use vergence_geometry::Transform;
 use vergence_tag::{Record, Shape};
 
 use polyhedron::Polyhedron;
@@ -155,18 +156,63 @@ impl Model {
         out.clear();
         let chords = if fine { FINE_CHORDS } else { COARSE_CHORDS };
         match self {
-            Model::Polyhedron(body) => body.outline(eye, out),
+            Model::Polyhedron(body) => body.outline(eye, fine, out),
             Model::Frustum(body) => body.outline(eye, chords, out),
             Model::Sphere(radius) => revolution::sphere_outline(*radius, eye, chords, out),
         }
     }
 
-    /// Directions (object frame, unit) on which the object can rest.
+    /// The motions of the object frame that leave its form as it is to within a tolerance (m), of a
+    /// body with flat faces.
+    pub fn symmetries(&self, tolerance: f64) -> Vec<Transform> {
+        match self {
+            Model::Polyhedron(body) => body.symmetries(tolerance),
+            Model::Frustum(_) | Model::Sphere(_) => vec![Transform::identity()],
+        }
+    }
+
+    /// Directions (object frame, unit) in which flat faces are, on which the object can stand.
     pub fn resting_directions(&self) -> Vec<Vector3<f64>> {
         match self {
             Model::Polyhedron(body) => body.face_normals(),
             Model::Frustum(_) => vec![-Vector3::z(), Vector3::z()],
             Model::Sphere(_) => vec![-Vector3::z()],
         }
+    }
+
+    /// How the object rests that has this direction (object frame, unit) below: on the face, the line
+    /// of its wall or the point that is nearest.
+    pub fn rest(&self, below: &Vector3<f64>) -> Rest {
+        let anyhow = Rest { down: *below, held: Matrix3::zeros() };
+        let rests = match self {
+            // Any point of a ball is as good, and nothing keeps it from rolling.
+            Model::Sphere(_) => return anyhow,
+            Model::Polyhedron(body) => body.face_normals().into_iter().map(Rest::on).collect(),
+            Model::Frustum(body) => {
+                let down = body.wall(below);
+                let axis = down.cross(&Vector3::z()).normalize();
+                let lying = Rest { down, held: axis * axis.transpose() };
+                vec![Rest::on(-Vector3::z()), Rest::on(Vector3::z()), lying]
+            }
+        };
+        let near = |rest: &Rest| rest.down.dot(below);
+        rests.into_iter().max_by(|a, b| near(a).total_cmp(&near(b))).unwrap_or(anyhow)
+    }
+}
+
+/// How an object rests.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Rest {
+    /// Direction of what is below (object frame, unit).
+    pub down: Vector3<f64>,
+    /// Projection onto the turns (object frame) that this keeps it from: a face is kept from tilting, a
+    /// wall may roll.
+    pub held: Matrix3<f64>,
+}
+
+impl Rest {
+    /// On a flat face that looks this way.
+    pub fn on(down: Vector3<f64>) -> Self {
+        Rest { down, held: Matrix3::identity() - down * down.transpose() }
     }
 }

@@ -6,6 +6,8 @@ use vergence_geometry::{Camera, GaussianPoint, GaussianPose, Symmetry, Transform
 use vergence_imaging::Image;
 use vergence_tag::{Record, Shape};
 
+use crate::model::Model;
+
 /// A picture, the camera that took it and where that camera was.
 #[derive(Debug, Clone, Copy)]
 pub struct View<'a> {
@@ -44,11 +46,11 @@ pub struct Query<'a> {
     pub standing: Option<bool>,
 }
 
-/// Rotations that move the landmark by less than this (m) cannot be told apart by anybody: it is
+/// Motions that move the landmark by less than this (m) cannot be told apart by anybody: it is
 /// four standard deviations of a good triangulation.
 const SYMMETRY_SLACK: f64 = 0.004;
-/// Sides that differ by less than this (m) count as equal.
-const SIDE_TOLERANCE: f64 = 0.0005;
+/// A body counts as symmetric when its corners come this near (m) to where others were.
+const CORNER_TOLERANCE: f64 = 0.0004;
 
 impl Query<'_> {
     /// The landmark's position in the object frame (m) and its outward normal.
@@ -57,52 +59,47 @@ impl Query<'_> {
         Some((site.position.into(), Vector3::from(site.normal).try_normalize(1e-6)?))
     }
 
-    /// The turns of the object that neither its form nor its landmark can tell apart.
+    /// The motions of the object that neither its form nor its landmark can tell apart.
     pub fn symmetry(&self) -> Symmetry {
         let Some((landmark, _)) = self.landmark_in_object() else { return Symmetry::none() };
-        let keep = |q: &UnitQuaternion<f64>| (q * landmark - landmark).norm() < SYMMETRY_SLACK;
+        let keep = |s: &Transform| {
+            (s.transform_point(&landmark.into()).coords - landmark).norm() < SYMMETRY_SLACK
+        };
         match &self.record.shape {
-            Shape::Box => {
-                match Symmetry::of_box(self.record.bounding_box.sides(), SIDE_TOLERANCE) {
-                    Symmetry::Finite(turns) => {
-                        Symmetry::Finite(turns.into_iter().filter(keep).collect())
-                    }
-                    other => other,
-                }
-            }
             Shape::Cylinder { .. } => {
                 Symmetry::Revolution { flip: 2.0 * landmark.z.abs() < SYMMETRY_SLACK }
             }
             Shape::Cup { .. } => Symmetry::Revolution { flip: false },
             Shape::Sphere { .. } => Symmetry::Full,
-            Shape::Prism { .. } | Shape::Convex { .. } => Symmetry::none(),
+            Shape::Box | Shape::Prism { .. } | Shape::Convex { .. } => {
+                let motions = Model::new(self.record).symmetries(CORNER_TOLERANCE);
+                Symmetry::Finite(motions.into_iter().filter(keep).collect())
+            }
         }
     }
 }
 
-/// Sides that differ by less than this share look alike from edges of real objects.
-const NEAR_SHARE: f64 = 0.03;
+/// Corners that come nearer than this share of the widest side to where others were look alike from
+/// edges of real objects.
+const NEAR_SHARE: f64 = 0.02;
 
 impl Query<'_> {
-    /// Turns that change the object's outline by no more than objects deviate from their records.
-    pub(crate) fn near_symmetries(&self) -> Vec<UnitQuaternion<f64>> {
-        let sides = self.record.bounding_box.sides();
+    /// Motions that change the object's outline by no more than objects deviate from their records.
+    pub(crate) fn near_symmetries(&self, model: &Model) -> Vec<Transform> {
         match &self.record.shape {
-            Shape::Box => {
-                let widest = sides.iter().fold(0.0, |a: f64, &b| a.max(b));
-                match Symmetry::of_box(sides, NEAR_SHARE * widest) {
-                    Symmetry::Finite(turns) => turns,
-                    _ => Vec::new(),
-                }
+            Shape::Box | Shape::Prism { .. } | Shape::Convex { .. } => {
+                let sides = self.record.bounding_box.sides();
+                model.symmetries(NEAR_SHARE * sides.iter().fold(0.0, |a: f64, &b| a.max(b)))
             }
             Shape::Cylinder { .. } => {
                 // Upside down about the landmark's own direction: it stays as near as it can.
                 let (x, y) = self.landmark_in_object().map_or((1.0, 0.0), |(p, _)| (p.x, p.y));
                 let axis = Unit::try_new(Vector3::new(x, y, 0.0), 1e-9);
                 let axis = axis.unwrap_or(Vector3::x_axis());
-                vec![UnitQuaternion::from_axis_angle(&axis, std::f64::consts::PI)]
+                let over = UnitQuaternion::from_axis_angle(&axis, std::f64::consts::PI);
+                vec![Transform::from_parts(Default::default(), over)]
             }
-            _ => Vec::new(),
+            Shape::Cup { .. } | Shape::Sphere { .. } => Vec::new(),
         }
     }
 }
@@ -305,6 +302,8 @@ mod tests {
     #[test]
     fn what_cannot_be_seen_does_not_count_as_an_error() {
         let shift = Vector6::new(0.0, 0.0, 0.0, 0.01, 0.0, 0.0);
+        let over = UnitQuaternion::from_euler_angles(0.0, std::f64::consts::PI, 0.0);
+        let upside_down = Transform::from_parts(Default::default(), over);
         for (symmetry, freedoms, turn) in [
             (
                 Symmetry::Revolution { flip: false },
@@ -312,9 +311,9 @@ mod tests {
                 UnitQuaternion::from_euler_angles(0.0, 0.0, 2.0),
             ),
             (
-                Symmetry::of_box([0.1, 0.2, 0.3], 1e-4),
+                Symmetry::Finite(vec![Transform::identity(), upside_down]),
                 6,
-                UnitQuaternion::from_euler_angles(0.0, std::f64::consts::PI, 0.0),
+                over,
             ),
             (Symmetry::Full, 3, UnitQuaternion::from_euler_angles(1.0, 0.5, 2.0)),
         ] {

@@ -18,7 +18,7 @@ use vergence_geometry::gaussian::{perturb, skew};
 use super::equations::{Edge, Equations, Move, Offsets, Solution, VIEWS, by_part, part_of};
 use super::search::Search;
 use super::sites::{FORM_AT, Form, LIP_AT, Layout, SHARED, Site, State, sites};
-use crate::model::Kind;
+use crate::model::{Kind, Rest};
 
 /// Standard deviation of an edge's place once the pose is right (px): aliasing, gamma, blooming and
 /// bent edges, not only noise.
@@ -273,10 +273,8 @@ impl Search<'_> {
         let (residual, j) = self.landmark_residual(state);
         let weight = self.landmark_weight();
         let (mut a, mut b) = (j.transpose() * weight * j, j.transpose() * weight * residual);
-        if let Some(turn) = self.tilt(state) {
-            // Only the two turns that tilt the axis are measured, not the one about it.
-            let up = self.query.up.map_or(Vector3::z(), |u| u.into_inner());
-            let tilts = (Matrix3::identity() - up * up.transpose()) / (STANDING_SD * STANDING_SD);
+        if let Some((turn, held)) = self.tilt(state) {
+            let tilts = held / (STANDING_SD * STANDING_SD);
             let mut block = a.fixed_view_mut::<3, 3>(0, 0);
             block += tilts;
             let mut rhs = b.fixed_rows_mut::<3>(0);
@@ -298,7 +296,7 @@ impl Search<'_> {
         let landmark = (residual.transpose() * weight * residual).x;
         let form = (state.form - usual()).component_div(&form_sd()).norm_squared();
         let tilt = match self.tilt(state) {
-            Some(turn) => (turn.norm() / STANDING_SD).powi(2),
+            Some((turn, _)) => (turn.norm() / STANDING_SD).powi(2),
             None if self.query.up.is_some() && self.query.standing.is_none() => 2.0 * UNSUPPORTED,
             None => 0.0,
         };
@@ -312,22 +310,21 @@ impl Search<'_> {
         0.5 * (landmark + form + tilt + turns + pixels)
     }
 
-    /// The small turn (base frame) that would make the object stand exactly, when it seems to.
-    fn tilt(&self, state: &Refined) -> Option<Vector3<f64>> {
+    /// The small turn (base frame) that would make the object rest exactly, when it seems to, and a
+    /// projection onto the turns that resting keeps it from.
+    fn tilt(&self, state: &Refined) -> Option<(Vector3<f64>, Matrix3<f64>)> {
         let up = self.query.up?.into_inner();
-        let downs = match self.query.standing {
+        let turn = state.pose.rotation.to_rotation_matrix();
+        let rest = match self.query.standing {
             Some(false) => return None,
-            Some(true) => vec![-Vector3::z()],
-            None => self.model.resting_directions(),
+            Some(true) => Rest::on(-Vector3::z()),
+            None => self.model.rest(&(turn.inverse() * -up)),
         };
-        let nearest = downs
-            .into_iter()
-            .map(|down| state.pose.rotation * -down)
-            .max_by(|a, b| a.dot(&up).total_cmp(&b.dot(&up)))?;
-        let turn = nearest.cross(&up);
-        let stands = nearest.dot(&up) > 0.0
-            && (turn.norm() < STANDING_LIMIT || state.rests || self.query.standing == Some(true));
-        stands.then_some(turn)
+        let nearest = turn * -rest.down;
+        let tilt = nearest.cross(&up);
+        let rests = nearest.dot(&up) > 0.0
+            && (tilt.norm() < STANDING_LIMIT || state.rests || self.query.standing == Some(true));
+        rests.then(|| (tilt, turn * rest.held * turn.inverse()))
     }
 }
 

@@ -7,7 +7,7 @@
 //! turning them in shrinking steps.
 
 use nalgebra::{Unit, UnitQuaternion, Vector3};
-use vergence_geometry::Transform;
+use vergence_geometry::{Symmetry, Transform};
 
 use super::Config;
 use super::field::Field;
@@ -54,6 +54,8 @@ pub struct Search<'a> {
     pub model: &'a Model,
     /// What is known.
     pub query: &'a Query<'a>,
+    /// The motions of the object that nobody can tell apart.
+    pub symmetry: Symmetry,
     /// The landmark in the object frame.
     pub landmark: Vector3<f64>,
     /// Its outward normal in the object frame.

@@ -1,6 +1,7 @@
 //! Bodies with flat faces: cuboid, extruded polygon, convex hull.
 
-use nalgebra::Vector3;
+use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
+use vergence_geometry::Transform;
 
 use super::{Kind, Line, Outline};
 
@@ -32,8 +33,10 @@ struct Edge {
 
 /// Points closer than this (m) count as one; faces closer in direction than this as one plane.
 const WELD: f64 = 1e-6;
-/// A concave body's edges are cut into pieces of this share of their length to see which are hidden.
-const PIECES: usize = 12;
+/// A concave body's edges are cut into so many pieces to see which are hidden, and into so many in the
+/// search.
+const FINE_PIECES: usize = 12;
+const COARSE_PIECES: usize = 3;
 
 impl Polyhedron {
     /// A box of these sides (m).
@@ -57,12 +60,18 @@ impl Polyhedron {
     }
 
     /// The convex hull of a few points, by trying every plane through three of them: cubic in
-    /// their number, which a record bounds by 48.
+    /// their number, which a record bounds by 48. Points that are no corner of it do not matter.
     pub fn hull(points: &[Vector3<f64>]) -> Self {
+        let mut corners: Vec<Vector3<f64>> = Vec::new();
+        for p in points {
+            if corners.iter().all(|c| (c - p).norm() > WELD) {
+                corners.push(*p);
+            }
+        }
         let mut planes: Vec<(Vector3<f64>, f64)> = Vec::new();
-        for (i, a) in points.iter().enumerate() {
-            for (j, b) in points.iter().enumerate().skip(i + 1) {
-                for c in &points[j + 1..] {
+        for (i, a) in corners.iter().enumerate() {
+            for (j, b) in corners.iter().enumerate().skip(i + 1) {
+                for c in &corners[j + 1..] {
                     let Some(n) = (b - a).cross(&(c - a)).try_normalize(WELD * WELD) else {
                         continue;
                     };
@@ -72,7 +81,7 @@ impl Polyhedron {
                         let known = |(m, o): &(Vector3<f64>, f64)| {
                             (m - n).norm() < 1e-4 && (o - offset).abs() < 10.0 * WELD
                         };
-                        if !points.iter().any(outside) && !planes.iter().any(known) {
+                        if !corners.iter().any(outside) && !planes.iter().any(known) {
                             planes.push((n, offset));
                         }
                     }
@@ -80,21 +89,11 @@ impl Polyhedron {
             }
         }
         let loops = planes.iter().map(|(n, offset)| {
-            let mut on: Vec<usize> = (0..points.len())
-                .filter(|&i| (n.dot(&points[i]) - offset).abs() < 10.0 * WELD)
-                .collect();
-            let middle = on.iter().map(|&i| points[i]).sum::<Vector3<f64>>() / on.len() as f64;
-            let x = (points[on[0]] - middle).normalize();
-            let y = n.cross(&x);
-            let angle = |i: &usize| {
-                let d = points[*i] - middle;
-                d.dot(&y).atan2(d.dot(&x))
-            };
-            on.sort_by(|i, j| angle(i).total_cmp(&angle(j)));
-            on
+            let on = |&i: &usize| (n.dot(&corners[i]) - offset).abs() < 10.0 * WELD;
+            around(&corners, n, (0..corners.len()).filter(on))
         });
         let loops = loops.collect();
-        Self::from_loops(points.to_vec(), loops, true)
+        Self::from_loops(corners, loops, true)
     }
 
     fn from_loops(vertices: Vec<Vector3<f64>>, loops: Vec<Vec<usize>>, convex: bool) -> Self {
@@ -129,8 +128,61 @@ impl Polyhedron {
         self.faces.iter().map(|f| f.normal).collect()
     }
 
-    /// Writes the visible contour.
-    pub(super) fn outline(&self, eye: &Vector3<f64>, out: &mut Outline) {
+    /// The motions of the object frame that put every edge onto an edge, to within a tolerance (m);
+    /// the identity first.
+    pub fn symmetries(&self, tolerance: f64) -> Vec<Transform> {
+        let corner = |i: usize| self.vertices[i] - self.middle();
+        let used: Vec<usize> = (0..self.vertices.len())
+            .filter(|i| self.edges.iter().any(|e| e.ends.contains(i)))
+            .collect();
+        let mut found = vec![Transform::identity()];
+        // Two corners that span a plane with the middle say how the body is turned.
+        let size = |i: &usize| corner(*i).norm();
+        let Some(&a) = used.iter().max_by(|i, j| size(i).total_cmp(&size(j))) else { return found };
+        let spanned = |i: &usize| corner(a).cross(&corner(*i)).norm();
+        let Some(&b) = used.iter().max_by(|i, j| spanned(i).total_cmp(&spanned(j))) else {
+            return found;
+        };
+        let near = |x: f64, y: f64| (x - y).abs() <= 2.0 * tolerance;
+        let Some(here) = frame(corner(a), corner(b)) else { return found };
+        for &i in used.iter().filter(|i| near(size(i), size(&a))) {
+            for &j in used.iter().filter(|j| near(size(j), size(&b))) {
+                if !near((corner(i) - corner(j)).norm(), (corner(a) - corner(b)).norm()) {
+                    continue;
+                }
+                let Some(there) = frame(corner(i), corner(j)) else { continue };
+                let turn = Rotation3::from_matrix_unchecked(there * here.transpose());
+                let turn = UnitQuaternion::from_rotation_matrix(&turn);
+                let shift = self.middle() - turn * self.middle();
+                let motion = Transform::from_parts(shift.into(), turn);
+                let new = found.iter().all(|f| f.rotation.angle_to(&turn) > 0.01);
+                if new && self.is_kept(&motion, tolerance) {
+                    found.push(motion);
+                }
+            }
+        }
+        found
+    }
+
+    /// The middle of the body's edges: every symmetry leaves it where it is.
+    fn middle(&self) -> Vector3<f64> {
+        let ends = self.edges.iter().flat_map(|e| e.ends);
+        ends.map(|i| self.vertices[i]).sum::<Vector3<f64>>() / (2 * self.edges.len()).max(1) as f64
+    }
+
+    /// Whether a motion puts every edge onto an edge.
+    fn is_kept(&self, motion: &Transform, tolerance: f64) -> bool {
+        let moved = |i: usize| motion.rotation * self.vertices[i] + motion.translation.vector;
+        let near = |p: &Vector3<f64>, i: usize| (p - self.vertices[i]).norm() <= tolerance;
+        self.edges.iter().all(|edge| {
+            let [p, q] = edge.ends.map(moved);
+            let onto = |[i, j]: [usize; 2]| near(&p, i) && near(&q, j);
+            self.edges.iter().any(|e| onto(e.ends) || onto([e.ends[1], e.ends[0]]))
+        })
+    }
+
+    /// Writes the visible contour; `fine` cuts the edges of a concave body into more pieces.
+    pub(super) fn outline(&self, eye: &Vector3<f64>, fine: bool, out: &mut Outline) {
         // A bit a face; records have at most 26 faces of prisms, hulls at most 92.
         let mut seen = 0u128;
         for (k, face) in self.faces.iter().enumerate().take(128) {
@@ -157,50 +209,106 @@ impl Polyhedron {
             if self.convex {
                 out.lines.push(line);
             } else {
-                self.visible_pieces(eye, edge, line, out);
+                let pieces = if fine { FINE_PIECES } else { COARSE_PIECES };
+                self.visible_pieces(eye, (edge, line), seen, pieces, out);
             }
         }
     }
 
-    fn visible_pieces(&self, eye: &Vector3<f64>, edge: &Edge, whole: Line, out: &mut Outline) {
+    fn visible_pieces(
+        &self,
+        eye: &Vector3<f64>,
+        (edge, whole): (&Edge, Line),
+        seen: u128,
+        pieces: usize,
+        out: &mut Outline,
+    ) {
         let [from, to] = edge.ends.map(|v| self.vertices[v]);
         let first = out.points.len();
-        let step = (to - from).norm() / PIECES as f64;
-        out.points.extend((0..=PIECES).map(|k| from.lerp(&to, k as f64 / PIECES as f64)));
-        for k in first..first + PIECES {
+        let step = (to - from).norm() / pieces as f64;
+        out.points.extend((0..=pieces).map(|k| from.lerp(&to, k as f64 / pieces as f64)));
+        for k in first..first + pieces {
             let middle = (out.points[k] + out.points[k + 1]) / 2.0;
-            if !self.hides(&middle, eye, edge) {
+            if !self.hides(&middle, eye, edge, seen) {
                 let along = step * (k - first) as f64;
                 out.lines.push(Line { ends: [k as u16, k as u16 + 1], along, ..whole });
             }
         }
     }
 
-    /// Whether some face other than the edge's own lies between a point and the eye.
-    fn hides(&self, point: &Vector3<f64>, eye: &Vector3<f64>, edge: &Edge) -> bool {
-        let others = self.faces.iter().enumerate().filter(|(f, _)| !edge.faces.contains(f));
+    /// Whether some face other than the edge's own lies between a point and the eye. A line of sight
+    /// comes into a body through a face that is seen, so only those need be looked at.
+    fn hides(&self, point: &Vector3<f64>, eye: &Vector3<f64>, edge: &Edge, seen: u128) -> bool {
+        let faces = self.faces.iter().enumerate();
+        let others = faces.filter(|(f, _)| seen >> f & 1 == 1 && !edge.faces.contains(f));
         others.map(|(_, face)| face).any(|face| {
-            let (a, b) = (face.normal.dot(point) - face.offset, face.normal.dot(eye) - face.offset);
-            if a * b >= 0.0 || a.abs() < WELD {
+            let (behind, before) =
+                (face.normal.dot(point) - face.offset, face.normal.dot(eye) - face.offset);
+            if behind > -WELD {
                 return false;
             }
-            let hit = point.lerp(eye, a / (a - b));
-            self.inside(face, &hit)
+            self.inside(face, &point.lerp(eye, behind / (behind - before)))
         })
     }
 
-    /// Whether a point of a face's plane lies within the face: winding number by summed angles.
+    /// Whether a point of a face's plane lies within the face: a ray in the plane crosses its border
+    /// an odd number of times. The plane is looked at along the axis that it faces most.
     fn inside(&self, face: &Face, point: &Vector3<f64>) -> bool {
-        let n = face.loop_.len();
-        let turn: f64 = (0..n)
-            .map(|k| {
-                let a = self.vertices[face.loop_[k]] - point;
-                let b = self.vertices[face.loop_[(k + 1) % n]] - point;
-                face.normal.dot(&a.cross(&b)).atan2(a.dot(&b))
-            })
-            .sum();
-        turn.abs() > 1.0
+        let along = face.normal.iamax();
+        let flat = |p: &Vector3<f64>| (p[(along + 1) % 3], p[(along + 2) % 3]);
+        let (x, y) = flat(point);
+        let mut inside = false;
+        let mut from = flat(&self.vertices[face.loop_[face.loop_.len() - 1]]);
+        for &corner in &face.loop_ {
+            let to = flat(&self.vertices[corner]);
+            if (from.1 > y) != (to.1 > y)
+                && x < from.0 + (to.0 - from.0) * (y - from.1) / (to.1 - from.1)
+            {
+                inside = !inside;
+            }
+            from = to;
+        }
+        inside
     }
+}
+
+/// The corners of a convex face among points of its plane, counter-clockwise from outside: Andrew's
+/// monotone chain. What lies within the face or on one of its edges is left out.
+fn around(
+    points: &[Vector3<f64>],
+    normal: &Vector3<f64>,
+    on: impl Iterator<Item = usize>,
+) -> Vec<usize> {
+    let x = normal.cross(&Vector3::ith(normal.iamin(), 1.0)).normalize();
+    let y = normal.cross(&x);
+    let mut on: Vec<(f64, f64, usize)> =
+        on.map(|i| (points[i].dot(&x), points[i].dot(&y), i)).collect();
+    on.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)));
+    // Left of the line from a to b by more than the tolerance.
+    let left = |a: &(f64, f64, usize), b: &(f64, f64, usize), p: &(f64, f64, usize)| {
+        let (dx, dy) = (b.0 - a.0, b.1 - a.1);
+        dx * (p.1 - a.1) - dy * (p.0 - a.0) > WELD * dx.hypot(dy)
+    };
+    let half = |on: &mut dyn Iterator<Item = &(f64, f64, usize)>| {
+        let mut chain: Vec<(f64, f64, usize)> = Vec::new();
+        for p in on {
+            while chain.len() > 1 && !left(&chain[chain.len() - 2], &chain[chain.len() - 1], p) {
+                chain.pop();
+            }
+            chain.push(*p);
+        }
+        chain.pop();
+        chain
+    };
+    let (below, above) = (half(&mut on.iter()), half(&mut on.iter().rev()));
+    below.into_iter().chain(above).map(|p| p.2).collect()
+}
+
+/// Axes: along the first vector, and so that the second lies in the plane of the first two.
+fn frame(a: Vector3<f64>, b: Vector3<f64>) -> Option<Matrix3<f64>> {
+    let x = a.try_normalize(WELD)?;
+    let z = a.cross(&b).try_normalize(WELD * WELD)?;
+    Some(Matrix3::from_columns(&[x, z.cross(&x), z]))
 }
 
 #[cfg(test)]
@@ -226,13 +334,48 @@ mod tests {
     fn a_hull_of_a_box_is_the_box() {
         let body = Polyhedron::cuboid(Vector3::new(0.1, 0.2, 0.3));
         let mut points = body.vertices.clone();
+        // Within the body, in a face, on an edge, and a corner again.
         points.push(Vector3::new(0.01, 0.0, 0.02));
+        points.insert(0, Vector3::new(0.05, 0.01, 0.02));
+        points.insert(3, Vector3::new(0.05, 0.1, 0.02));
+        points.push(points[1]);
         let hull = Polyhedron::hull(&points);
         assert_eq!((hull.faces.len(), hull.edges.len()), (6, 12));
         let eye = Vector3::new(0.8, -1.0, 1.2);
         for kind in [Kind::Silhouette, Kind::Crease] {
             assert!((lengths(&body, eye, kind) - lengths(&hull, eye, kind)).abs() < 1e-12);
         }
+    }
+
+    #[test]
+    fn a_body_is_mapped_onto_itself_by_the_turns_of_its_group() {
+        let regular = |n: usize, at: [f64; 2]| -> Vec<[f64; 2]> {
+            let angle = |k: usize| std::f64::consts::TAU * k as f64 / n as f64;
+            (0..n).map(|k| [at[0] + 0.05 * angle(k).cos(), at[1] + 0.05 * angle(k).sin()]).collect()
+        };
+        let count = |body: &Polyhedron| body.symmetries(1e-4).len();
+        // A regular prism: n turns about its axis, and n upside down.
+        for n in [3, 5, 6] {
+            assert_eq!(count(&Polyhedron::prism(&regular(n, [0.0, 0.0]), 0.2)), 2 * n);
+        }
+        for (sides, turns) in [([0.1, 0.2, 0.3], 4), ([0.1, 0.1, 0.3], 8), ([0.1, 0.1, 0.1], 24)] {
+            assert_eq!(count(&Polyhedron::cuboid(sides.into())), turns);
+        }
+        let cube = Polyhedron::cuboid(Vector3::repeat(0.1));
+        assert_eq!(count(&Polyhedron::hull(&cube.vertices)), 24);
+        // Beside the origin its corners still come onto each other.
+        let body = Polyhedron::prism(&regular(3, [0.02, -0.01]), 0.2);
+        let turns = body.symmetries(1e-4);
+        assert_eq!(turns.len(), 6);
+        for turn in turns {
+            for v in &body.vertices {
+                let moved = turn.rotation * v + turn.translation.vector;
+                assert!(body.vertices.iter().any(|w| (w - moved).norm() < 1e-9));
+            }
+        }
+        // An L may only be turned over, about the diagonal of its notch.
+        let outline = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.0], [0.0, 0.0], [0.0, 0.1], [-0.1, 0.1]];
+        assert_eq!(count(&Polyhedron::prism(&outline, 0.2)), 2);
     }
 
     #[test]

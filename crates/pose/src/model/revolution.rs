@@ -24,11 +24,22 @@ impl Frustum {
         Frustum { top, bottom, half_height: height / 2.0, open }
     }
 
+    /// Outward normal of the wall (unit) where it is nearest to a direction.
+    pub(super) fn wall(&self, direction: &Vector3<f64>) -> Vector3<f64> {
+        let radial = direction.xy().try_normalize(1e-9).unwrap_or(Vector2::x());
+        radial.push(-self.slope()).normalize()
+    }
+
+    /// How much the radius grows with the height.
+    fn slope(&self) -> f64 {
+        (self.top - self.bottom) / (2.0 * self.half_height)
+    }
+
     /// Writes the visible contour with `chords` chords for a whole rim.
     pub(super) fn outline(&self, eye: &Vector3<f64>, chords: usize, out: &mut Outline) {
         // The wall's outward normal at azimuth t is (cos t, sin t, -slope); it faces the eye where
         // ex cos t + ey sin t > radius at the eye's own height, extrapolated along the wall.
-        let slope = (self.top - self.bottom) / (2.0 * self.half_height);
+        let slope = self.slope();
         let reach = (self.top + self.bottom) / 2.0 + slope * eye.z;
         let across = eye.x.hypot(eye.y);
         let towards = eye.y.atan2(eye.x);
