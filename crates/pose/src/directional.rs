@@ -9,6 +9,7 @@
 pub mod edges;
 mod equations;
 pub mod field;
+pub mod landmark;
 pub mod level;
 mod neighbours;
 pub mod picture;
@@ -145,8 +146,7 @@ pub fn recognise_traced<'a>(
     if sights.is_empty() {
         return Err(Refusal::OutOfView);
     }
-    let symmetry = query.symmetry();
-    let search = Search { sights: &sights, model: &model, query, symmetry, landmark, normal, config };
+    let search = Search::new(&sights, &model, query, (landmark, normal), config);
     let hypotheses = search.hypotheses();
     let rough = hypotheses.iter().map(|h| search.refine_roughly(&h.pose, h.rests)).collect();
     let rough = search.ranked(rough, config.distinct);
@@ -180,8 +180,7 @@ pub fn track(
     if sights.is_empty() {
         return Err(Refusal::OutOfView);
     }
-    let symmetry = query.symmetry();
-    let search = Search { sights: &sights, model: &model, query, symmetry, landmark, normal, config };
+    let search = Search::new(&sights, &model, query, (landmark, normal), config);
     let (rough, _) = search.refine_roughly(last, false);
     let (mut refined, explained) = search.refine_finely(rough);
     search.doubt(&mut refined, &FINAL);

@@ -19,7 +19,8 @@ pub struct View<'a> {
     pub base_from_optical: Transform,
     /// Standard deviation of a small turn of the camera about its own x and y axes (rad): how well
     /// the head's angles are known. Zero when exactly. When it is not zero, the landmark is taken
-    /// to have been triangulated from these very views, so that its error and theirs are one.
+    /// to have been triangulated from these views (and others, when it is better known than they
+    /// could tell), so that a part of its error is theirs.
     pub turn_sd: f64,
 }
 
@@ -310,11 +311,7 @@ mod tests {
                 5,
                 UnitQuaternion::from_euler_angles(0.0, 0.0, 2.0),
             ),
-            (
-                Symmetry::Finite(vec![Transform::identity(), upside_down]),
-                6,
-                over,
-            ),
+            (Symmetry::Finite(vec![Transform::identity(), upside_down]), 6, over),
             (Symmetry::Full, 3, UnitQuaternion::from_euler_angles(1.0, 0.5, 2.0)),
         ] {
             let found = found(symmetry);

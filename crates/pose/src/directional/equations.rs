@@ -17,8 +17,9 @@
 //! where a shadow or another object ends beside it).
 
 use multiversion::multiversion;
-use nalgebra::{Cholesky, Const, Matrix6, SMatrix, SVector, Vector2};
+use nalgebra::{Cholesky, Const, Matrix6, SMatrix, SVector, Vector2, Vector3};
 
+use super::landmark::Landmark;
 use super::sites::{LIP_AT, SHARED, Site};
 
 /// Unknowns of each view: small turns of its camera.
@@ -64,7 +65,7 @@ pub(super) struct Edge<'a> {
     pub site: &'a Site,
     /// It is the inner edge of the lip.
     pub inner: bool,
-    /// Against a site with one edge of good contrast.
+    /// Against a site with one edge of good contrast: how many measurements it counts for.
     pub weight: f64,
     /// How far off it is (px).
     pub residual: f64,
@@ -170,20 +171,23 @@ impl Equations {
         }
     }
 
-    /// Adds a measured pixel.
-    pub fn pixel(
+    /// Adds the landmark: how far it is from its place (m), and how its place depends on the shared
+    /// unknowns.
+    pub fn landmark(
         &mut self,
-        view: usize,
-        by_shared: &SMatrix<f64, 2, SHARED>,
-        by_own: &SMatrix<f64, 2, OWN>,
-        weight: f64,
-        residual: &Vector2<f64>,
+        residual: &Vector3<f64>,
+        by_shared: &SMatrix<f64, 3, SHARED>,
+        measured: &Landmark,
     ) {
-        for k in 0..2 {
+        let (residual, by_shared) = (measured.whiten * residual, measured.whiten * by_shared);
+        let by_turn = measured.by_turn.map(|by_turn| measured.whiten * by_turn);
+        for k in 0..3 {
             let mut by = [0.0; PADDED];
             by.iter_mut().zip(&by_shared.row(k)).for_each(|(b, j)| *b = *j);
-            by[SHARED + OWN * view..].iter_mut().zip(&by_own.row(k)).for_each(|(b, j)| *b = *j);
-            self.sums.add(weight, residual[k], &by);
+            for (own, by_turn) in by[SHARED..].chunks_mut(OWN).zip(&by_turn) {
+                own.iter_mut().zip(&by_turn.row(k)).for_each(|(b, j)| *b = *j);
+            }
+            self.sums.add(1.0, residual[k], &by);
         }
     }
 

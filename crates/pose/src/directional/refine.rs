@@ -11,7 +11,7 @@
 //! the servos' accuracy. The foot of a standing object, where the shadow begins, is measured only
 //! coarsely.
 
-use nalgebra::{Matrix2, Matrix3, Matrix6, Point3, SMatrix, SVector, Vector2, Vector3};
+use nalgebra::{Matrix3, Matrix6, SMatrix, SVector, Vector2, Vector3};
 use vergence_geometry::Transform;
 use vergence_geometry::gaussian::{perturb, skew};
 
@@ -46,10 +46,6 @@ pub fn absence(kind: Kind) -> f64 {
     }
 }
 
-/// Deviation of the light's place on the object from the record's (m): tags are stuck on by hand.
-const PLACE_SD: f64 = 0.001;
-/// Deviation of the pixel where a camera saw the landmark, lobe and housing included (px).
-const LANDMARK_SD_PX: f64 = 0.3;
 /// Thickness of the lip of an open rim (m), and its deviation.
 const LIP: f64 = 0.003;
 const LIP_SD: f64 = 0.0015;
@@ -205,10 +201,9 @@ impl Search<'_> {
         now.apply(moved);
         let (a, b) = self.prior(&now);
         equations.shared(&a, &b);
+        let (residual, by_shared) = self.landmark_residual(&now);
+        equations.landmark(&residual, &by_shared, &self.measured);
         for view in 0..self.sights.len() {
-            if let Some((residual, by_shared, by_own)) = self.landmark_pixel(&now, view) {
-                equations.pixel(view, &by_shared, &by_own, LANDMARK_SD_PX.powi(-2), &residual);
-            }
             equations.own(view, self.turn_precision(view), &-now.turns[view]);
         }
         equations.solve()
@@ -219,7 +214,8 @@ impl Search<'_> {
         self.sights[view].view.turn_sd.max(1e-9).powi(-2)
     }
 
-    /// Residual of the landmark (m) and its derivative by the shared unknowns.
+    /// Residual of the landmark (m), the cameras' turns considered, and the derivative of its place by
+    /// the shared unknowns.
     fn landmark_residual(&self, state: &Refined) -> (Vector3<f64>, SMatrix<f64, 3, SHARED>) {
         let lever = state.pose.rotation * self.landmark * state.form.x.exp();
         let centre = state.pose.translation.vector;
@@ -227,52 +223,14 @@ impl Search<'_> {
         j.fixed_view_mut::<3, 3>(0, 0).copy_from(&-skew(&lever));
         j.fixed_view_mut::<3, 3>(0, 3).copy_from(&Matrix3::identity());
         j.fixed_view_mut::<3, 1>(0, FORM_AT).copy_from(&lever);
-        (self.query.landmark.position.coords - centre - lever, j)
+        let turns = self.measured.by_turn.iter().zip(&state.turns);
+        let moved: Vector3<f64> = turns.map(|(by_turn, turn)| by_turn * turn).sum();
+        (self.query.landmark.position.coords - moved - centre - lever, j)
     }
 
-    /// Whether the landmark holds the cameras' angles: it was triangulated from these very views,
-    /// so its error *is* theirs, and what is certain is the pixel where each camera saw it.
-    fn landmark_is_pixels(&self) -> bool {
-        self.sights.len() > 1 && self.sights.iter().all(|s| s.view.turn_sd > 0.0)
-    }
-
-    /// Residual (px) of the landmark in a view and its derivatives by the shared and own unknowns.
-    fn landmark_pixel(
-        &self,
-        state: &Refined,
-        view: usize,
-    ) -> Option<(Vector2<f64>, SMatrix<f64, 2, SHARED>, Matrix2<f64>)> {
-        if !self.landmark_is_pixels() {
-            return None;
-        }
-        let sight = &self.sights[view];
-        let seen = sight.optical_from_base * self.query.landmark.position;
-        let seen = sight.view.camera.project(&seen)?;
-        let turned = Transform::rotation(state.turns[view].push(0.0));
-        let optical_from_base = turned * sight.optical_from_base;
-        let lever = state.pose.rotation * self.landmark * state.form.x.exp();
-        let p = optical_from_base * Point3::from(state.pose.translation.vector + lever);
-        let (pixel, by_point) = sight.view.camera.project_with_jacobian(&p)?;
-        let by_base = by_point * optical_from_base.rotation.to_rotation_matrix();
-        let mut by_shared = SMatrix::<f64, 2, SHARED>::zeros();
-        by_shared.fixed_view_mut::<2, 3>(0, 0).copy_from(&(by_base * -skew(&lever)));
-        by_shared.fixed_view_mut::<2, 3>(0, 3).copy_from(&by_base);
-        by_shared.fixed_view_mut::<2, 1>(0, FORM_AT).copy_from(&(by_base * lever));
-        let by_turn = by_point * -skew(&p.coords);
-        Some((seen - pixel, by_shared, by_turn.fixed_columns::<2>(0).into_owned()))
-    }
-
-    /// What the landmark's measurement is worth as a point (1/m^2).
-    pub(super) fn landmark_weight(&self) -> Matrix3<f64> {
-        let place = Matrix3::identity() * (PLACE_SD * PLACE_SD);
-        (self.query.landmark.covariance + place).try_inverse().unwrap_or_default()
-    }
-
-    /// Information and right-hand side of the landmark, of gravity and of the form.
+    /// Information and right-hand side of gravity and of the form.
     fn prior(&self, state: &Refined) -> (SharedMatrix, SharedVector) {
-        let (residual, j) = self.landmark_residual(state);
-        let weight = self.landmark_weight();
-        let (mut a, mut b) = (j.transpose() * weight * j, j.transpose() * weight * residual);
+        let (mut a, mut b) = (SharedMatrix::zeros(), SharedVector::zeros());
         if let Some((turn, held)) = self.tilt(state) {
             let tilts = held / (STANDING_SD * STANDING_SD);
             let mut block = a.fixed_view_mut::<3, 3>(0, 0);
@@ -291,9 +249,7 @@ impl Search<'_> {
 
     /// What the priors hold against a state: half their squared normalised residuals.
     pub(super) fn strain(&self, state: &Refined) -> f64 {
-        let (residual, _) = self.landmark_residual(state);
-        let weight = self.landmark_weight();
-        let landmark = (residual.transpose() * weight * residual).x;
+        let landmark = (self.measured.whiten * self.landmark_residual(state).0).norm_squared();
         let form = (state.form - usual()).component_div(&form_sd()).norm_squared();
         let tilt = match self.tilt(state) {
             Some((turn, _)) => (turn.norm() / STANDING_SD).powi(2),
@@ -303,11 +259,7 @@ impl Search<'_> {
         let turns: f64 = (0..self.sights.len())
             .map(|v| self.turn_precision(v) * state.turns[v].norm_squared())
             .sum();
-        let pixels: f64 = (0..self.sights.len())
-            .filter_map(|v| self.landmark_pixel(state, v))
-            .map(|(residual, ..)| (residual / LANDMARK_SD_PX).norm_squared())
-            .sum();
-        0.5 * (landmark + form + tilt + turns + pixels)
+        0.5 * (landmark + form + tilt + turns)
     }
 
     /// The small turn (base frame) that would make the object rest exactly, when it seems to, and a

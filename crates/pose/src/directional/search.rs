@@ -11,6 +11,7 @@ use vergence_geometry::{Symmetry, Transform};
 
 use super::Config;
 use super::field::Field;
+use super::landmark::Landmark;
 use super::level::Level;
 use crate::model::{Kind, Model, Outline};
 use crate::rotations;
@@ -54,6 +55,8 @@ pub struct Search<'a> {
     pub model: &'a Model,
     /// What is known.
     pub query: &'a Query<'a>,
+    /// What the landmark says about the object's place.
+    pub measured: Landmark,
     /// The motions of the object that nobody can tell apart.
     pub symmetry: Symmetry,
     /// The landmark in the object frame.
@@ -84,6 +87,20 @@ impl Sight<'_> {
         let (x, y) = if self.straight { (x, y) } else { camera.distort(x, y) };
         let (u, v) = self.coarse.from_picture(camera.fx * x + camera.cx, camera.fy * y + camera.cy);
         (u as f32, v as f32)
+    }
+}
+
+impl<'a> Search<'a> {
+    /// A search for a query that has been checked, with its landmark's place and normal in the object.
+    pub fn new(
+        sights: &'a [Sight<'a>],
+        model: &'a Model,
+        query: &'a Query<'a>,
+        (landmark, normal): (Vector3<f64>, Vector3<f64>),
+        config: &'a Config,
+    ) -> Self {
+        let (measured, symmetry) = (Landmark::new(sights, query), query.symmetry());
+        Search { sights, model, query, measured, symmetry, landmark, normal, config }
     }
 }
 
