@@ -182,9 +182,9 @@ pub fn track(
     }
     let search = Search::new(&sights, &model, query, (landmark, normal), config);
     let (rough, _) = search.refine_roughly(last, false);
-    let (mut refined, explained) = search.refine_finely(rough);
-    search.doubt(&mut refined, &FINAL);
-    let found = search.verdict(&[(refined, explained)])?;
+    let mut best = search.refine_finely(rough);
+    search.settle(&mut best);
+    let found = search.verdict(&[best])?;
     let turned = search.symmetry.angle_between(&found.pose.pose.rotation, &last.rotation);
     if turned > config.most_turn {
         return Err(Refusal::Lost { turned_deg: turned.to_degrees(), best: Box::new(found) });
@@ -337,16 +337,7 @@ impl Search<'_> {
         (refined, explained)
     }
 
-    /// How different two poses are (rad): by how much they are turned against each other, or by how
-    /// far the object is off, seen from as far away as it reaches. Of symmetric twins the nearest.
-    fn between(&self, a: &Transform, b: &Transform) -> f64 {
-        let near = self.symmetry.nearest(b, a);
-        let reach = 0.5 * Vector3::from(self.query.record.bounding_box.sides()).norm();
-        let off = (near.translation.vector - a.translation.vector).norm();
-        a.rotation.angle_to(&near.rotation).max(off / reach)
-    }
-
-    /// Best first, without those less than `apart` (rad) from a better one.
+    /// Best first, without those that are [`Search::alike`] a better one.
     fn ranked(
         &self,
         mut found: Vec<(Refined, Explained)>,
@@ -356,8 +347,7 @@ impl Search<'_> {
         let mut kept: Vec<(Refined, Explained)> = Vec::new();
         for candidate in found {
             let pose = &candidate.0.pose;
-            let away = |k: &(Refined, Explained)| self.between(&k.0.pose, pose) > apart;
-            if kept.iter().all(away) {
+            if kept.iter().all(|k| !self.alike(&k.0.pose, pose, apart)) {
                 kept.push(candidate);
             }
         }
@@ -375,7 +365,7 @@ impl Search<'_> {
             .near_symmetries(self.model)
             .into_iter()
             .map(|s| of.pose * s)
-            .filter(|p| self.between(p, &of.pose) > self.config.different)
+            .filter(|p| !self.alike(p, &of.pose, self.config.different))
             .filter(stands)
             .map(|pose| {
                 let mut twin = Refined { pose, ..of.without_sites() };
@@ -392,7 +382,9 @@ impl Search<'_> {
             return Err(Refusal::NoAttitude);
         };
         let odds = |e: &Explained| (e.evidence - explained.evidence).exp();
-        let total = 1.0 + others.iter().map(|o| odds(&o.1)).sum::<f64>();
+        // That there is nothing is one more way to explain the edges: it has no evidence.
+        let total =
+            1.0 + odds(&Explained::default()) + others.iter().map(|o| odds(&o.1)).sum::<f64>();
         let others = others.iter().map(|o| (o.0.pose, odds(&o.1)));
         let mut alternatives: Vec<Alternative> =
             others.map(|(pose, odds)| Alternative { pose, confidence: odds / total }).collect();

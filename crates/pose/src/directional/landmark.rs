@@ -75,6 +75,8 @@ fn positive(m: Matrix3<f64>) -> Matrix3<f64> {
 
 #[cfg(test)]
 mod tests {
+    use std::f64::consts::FRAC_PI_2;
+
     use super::*;
     use crate::directional::{Config, prepare};
     use crate::types::View;
@@ -99,7 +101,7 @@ mod tests {
             camera: Camera::centred(320, 240, 300.0),
             base_from_optical: Transform::from_parts(
                 nalgebra::Vector3::new(0.0, y, 0.4).into(),
-                UnitQuaternion::from_euler_angles(-1.9, 0.0, -1.5708 - 2.0 * y),
+                UnitQuaternion::from_euler_angles(-1.9, 0.0, -FRAC_PI_2 - 2.0 * y),
             ),
             turn_sd,
         });

@@ -141,14 +141,14 @@ impl Search<'_> {
         found.sort_by(|a, b| b.evidence.total_cmp(&a.evidence));
         let least = found.first().map_or(0.0, |best| self.config.worth_a_climb * best.evidence);
         found.retain(|h| h.evidence >= least);
-        let mut seeds = distinct(&found, self.config.seeds, self.config.grid_spacing);
+        let mut seeds = self.distinct(&found, self.config.seeds, self.config.grid_spacing);
         for seed in &mut seeds {
             self.climb(seed, about, &mut scratch);
         }
         seeds.sort_by(|a, b| b.evidence.total_cmp(&a.evidence));
         let least = seeds.first().map_or(0.0, |best| self.config.worth * best.evidence);
         seeds.retain(|h| h.evidence >= least);
-        let mut best = distinct(&seeds, count, 0.5 * self.config.grid_spacing);
+        let mut best = self.distinct(&seeds, count, 0.5 * self.config.grid_spacing);
         for hypothesis in &mut best {
             hypothesis.rests = about.is_some();
         }
@@ -251,18 +251,29 @@ impl Search<'_> {
             step *= 0.5;
         }
     }
-}
 
-/// The first `count` of a sorted list that are at least `apart` (rad) from every earlier one.
-fn distinct(sorted: &[Hypothesis], count: usize, apart: f64) -> Vec<Hypothesis> {
-    let mut kept: Vec<Hypothesis> = Vec::with_capacity(count);
-    for h in sorted {
-        if kept.len() == count {
-            break;
+    /// The first `count` of a sorted list that are not [`Search::alike`] an earlier one.
+    fn distinct(&self, sorted: &[Hypothesis], count: usize, apart: f64) -> Vec<Hypothesis> {
+        let mut kept: Vec<Hypothesis> = Vec::with_capacity(count);
+        for h in sorted {
+            if kept.len() == count {
+                break;
+            }
+            if kept.iter().all(|k| !self.alike(&k.pose, &h.pose, apart)) {
+                kept.push(*h);
+            }
         }
-        if kept.iter().all(|k| k.pose.rotation.angle_to(&h.pose.rotation) > apart) {
-            kept.push(*h);
-        }
+        kept
     }
-    kept
+
+    /// Whether two poses differ by no more than this turn (rad), and are no further from each other
+    /// than such a turn about the object's middle moves its corners. Of symmetric twins the nearest.
+    pub(super) fn alike(&self, a: &Transform, b: &Transform, apart: f64) -> bool {
+        if self.symmetry.angle_between(&a.rotation, &b.rotation) > apart {
+            return false;
+        }
+        let reach = 0.5 * Vector3::from(self.query.record.bounding_box.sides()).norm();
+        let near = self.symmetry.nearest(b, a);
+        (near.translation.vector - a.translation.vector).norm() <= apart * reach
+    }
 }

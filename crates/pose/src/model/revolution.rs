@@ -150,6 +150,10 @@ fn turned(v: &Vector2<f64>, by: &Vector2<f64>) -> Vector2<f64> {
     Vector2::new(v.x * by.x - v.y * by.y, v.x * by.y + v.y * by.x)
 }
 
+/// Parts of a ball's outline. Where it is lit from the side its wall darkens towards the outline, and
+/// what is seen lies further inside than where it is lit from before: no part is off like all others.
+const ARCS: u16 = 6;
+
 /// Writes the outline of a ball: the circle where the lines of sight touch it.
 pub(super) fn sphere_outline(radius: f64, eye: &Vector3<f64>, chords: usize, out: &mut Outline) {
     let distance = eye.norm();
@@ -170,7 +174,8 @@ pub(super) fn sphere_outline(radius: f64, eye: &Vector3<f64>, chords: usize, out
     for k in 0..chords as u16 {
         let ends = [k, (k + 1) % chords as u16];
         let along = r * TAU * f64::from(k) / chords as f64;
-        out.lines.push(Line { ends, kind: Kind::Silhouette, away: None, part: 0, along });
+        let part = ARCS * k / chords as u16;
+        out.lines.push(Line { ends, kind: Kind::Silhouette, away: None, part, along });
     }
 }
 

@@ -1,0 +1,160 @@
+//! Shapes beside boxes: their symmetries, how they rest, what is ambiguous.
+
+use std::f64::consts::{FRAC_PI_2, PI, TAU};
+
+use nalgebra::{Point3, UnitQuaternion, Vector3};
+use serde_json::json;
+use vergence_geometry::{Symmetry, Transform};
+use vergence_pose::directional::{self, Config};
+use vergence_pose::{ObjectPose, Refusal};
+use vergence_tag::Record;
+
+use crate::scene::{Piece, Scene};
+
+/// A record of these sides (m) with a landmark.
+fn record(
+    sides: [f64; 3],
+    shape: serde_json::Value,
+    landmark: [f64; 3],
+    normal: [f64; 3],
+) -> Record {
+    let [width, length, height] = sides;
+    let record = json!({
+        "object_id": "object",
+        "landmarks": [{"position": landmark, "normal": normal}],
+        "bounding_box": {"width": width, "length": length, "height": height},
+        "shape": shape,
+    });
+    serde_json::from_value(record).unwrap_or_else(|e| panic!("{e}"))
+}
+
+fn recognise(scene: &Scene, record: &Record, up: bool) -> Result<ObjectPose, Refusal> {
+    directional::recognise(&scene.views(), &scene.query(record, up), &Config::default())
+}
+
+/// Fails unless the pose is right but for what its symmetry leaves open.
+fn assert_right(found: &Result<ObjectPose, Refusal>, truth: &Transform) {
+    let found = found.as_ref().unwrap_or_else(|e| panic!("{e}"));
+    let (pose, symmetry) = (&found.pose.pose, &found.symmetry);
+    let near = symmetry.nearest(truth, pose);
+    let mm = 1e3 * (near.translation.vector - pose.translation.vector).norm();
+    let deg = symmetry.angle_between(&truth.rotation, &pose.rotation).to_degrees();
+    assert!(mm < 3.0 && deg < 2.0, "off by {mm:.2} mm, {deg:.2} degrees");
+    let nees = found.nees(truth).map(|(squares, freedoms)| squares / freedoms as f64);
+    assert!(nees.is_some_and(|nees| nees < 3.0), "{nees:?}");
+}
+
+/// Corners of a regular polygon about a place.
+fn regular(corners: usize, radius: f64, [x, y]: [f64; 2]) -> Vec<[f64; 2]> {
+    let angle = |k: usize| TAU * k as f64 / corners as f64;
+    (0..corners).map(|k| [x + radius * angle(k).cos(), y + radius * angle(k).sin()]).collect()
+}
+
+/// A convex prism as it is drawn.
+fn drawn(outline: &[[f64; 2]], height: f64) -> Piece {
+    let next = outline.iter().cycle().skip(1);
+    let walls = outline.iter().zip(next).map(|(a, b)| {
+        let n = Vector3::new(b[1] - a[1], a[0] - b[0], 0.0).normalize();
+        (n, n.x * a[0] + n.y * a[1])
+    });
+    let ends = [Vector3::z(), -Vector3::z()].map(|n| (n, height / 2.0));
+    Piece::Flat(walls.chain(ends).collect())
+}
+
+#[test]
+fn a_regular_prism_is_found_but_for_its_symmetry() {
+    // Six corners, the landmark in the middle of the lid: it says nothing about sixths of a turn.
+    let outline = regular(6, 0.05, [0.0, 0.0]);
+    let shape = json!({"kind": "prism", "outline": outline, "height": 0.08});
+    let sides = [0.1, 2.0 * 0.05 * 0.75f64.sqrt(), 0.08];
+    let record = record(sides, shape, [0.0, 0.0, 0.04], [0.0, 0.0, 1.0]);
+    let turn = UnitQuaternion::from_euler_angles(0.0, 0.0, 0.3);
+    let scene = Scene::new(&record, &[drawn(&outline, 0.08)], turn, 3);
+    for up in [true, false] {
+        let found = recognise(&scene, &record, up);
+        assert_right(&found, &scene.truth);
+        let Symmetry::Finite(turns) = found.unwrap().symmetry else { panic!("not a finite group") };
+        assert_eq!(turns.len(), 6);
+    }
+}
+
+#[test]
+fn the_axis_of_a_symmetry_need_not_pass_the_origin() {
+    // Three corners: the middle of the bounding box is not the middle of the triangle.
+    let radius = 0.06;
+    let outline = regular(3, radius, [-radius / 4.0, 0.0]);
+    let shape = json!({"kind": "prism", "outline": outline, "height": 0.12});
+    let sides = [1.5 * radius, radius * 3f64.sqrt(), 0.12];
+    let landmark = [-radius / 4.0, 0.0, 0.06];
+    let record = record(sides, shape, landmark, [0.0, 0.0, 1.0]);
+    let turn = UnitQuaternion::from_euler_angles(0.2, -0.1, 0.5);
+    let scene = Scene::new(&record, &[drawn(&outline, 0.12)], turn, 4);
+    assert_right(&recognise(&scene, &record, false), &scene.truth);
+}
+
+#[test]
+fn a_prism_with_a_notch_is_found() {
+    let outline =
+        [[-0.06, -0.06], [0.06, -0.06], [0.06, 0.0], [0.0, 0.0], [0.0, 0.06], [-0.06, 0.06]];
+    let shape = json!({"kind": "prism", "outline": outline, "height": 0.1});
+    let record = record([0.12, 0.12, 0.1], shape, [-0.06, 0.01, 0.02], [-1.0, 0.0, 0.0]);
+    let pieces = [
+        Piece::cuboid([-0.06, -0.06, -0.05], [0.06, 0.0, 0.05]),
+        Piece::cuboid([-0.06, 0.0, -0.05], [0.0, 0.06, 0.05]),
+    ];
+    let turn = UnitQuaternion::from_euler_angles(0.3, 0.2, -0.4);
+    let scene = Scene::new(&record, &pieces, turn, 5);
+    assert_right(&recognise(&scene, &record, false), &scene.truth);
+}
+
+#[test]
+fn a_can_on_its_side_rests() {
+    let shape = json!({"kind": "cylinder", "diameter": 0.066, "height": 0.12});
+    let record = record([0.066, 0.066, 0.12], shape, [0.033, 0.0, 0.02], [1.0, 0.0, 0.0]);
+    for (seed, roll, turn) in [(6, 2.2, 0.6), (7, 3.6, -0.4), (8, 2.9, 1.0)] {
+        // On its side, rolled and turned; the landmark looks towards the cameras.
+        let turn = UnitQuaternion::from_euler_angles(0.0, 0.0, turn)
+            * UnitQuaternion::from_euler_angles(FRAC_PI_2, 0.0, 0.0)
+            * UnitQuaternion::from_euler_angles(0.0, 0.0, roll);
+        let scene =
+            Scene::new(&record, &[Piece::Cylinder { radius: 0.033, half: 0.06 }], turn, seed);
+        let found = recognise(&scene, &record, true);
+        assert_right(&found, &scene.truth);
+        let axis = found.unwrap().pose.pose.rotation * Vector3::z();
+        assert!(axis.z.abs() < 0.01, "gravity should hold the axis level, not at {:.3}", axis.z);
+    }
+}
+
+#[test]
+fn a_ball_rests_on_any_point() {
+    let shape = json!({"kind": "sphere", "diameter": 0.1});
+    let record = record([0.1, 0.1, 0.1], shape, [0.05, 0.0, 0.0], [1.0, 0.0, 0.0]);
+    for (seed, tilt) in [(9, -0.3), (10, 0.9), (11, 1.2)] {
+        let turn = UnitQuaternion::from_euler_angles(0.2, tilt, PI - 0.1);
+        let scene = Scene::new(&record, &[Piece::Ball(0.05, Point3::origin())], turn, seed);
+        assert_right(&recognise(&scene, &record, true), &scene.truth);
+    }
+}
+
+#[test]
+fn of_two_balls_that_touch_at_the_landmark_both_are_considered() {
+    // Nothing but the landmark could say which it is, and that is seen from where they touch.
+    let shape = json!({"kind": "sphere", "diameter": 0.08});
+    let record = record([0.08, 0.08, 0.08], shape, [0.04, 0.0, 0.0], [1.0, 0.0, 0.0]);
+    let turn = UnitQuaternion::from_euler_angles(0.0, 0.0, -FRAC_PI_2 - 0.2);
+    let other = Point3::new(0.08, 0.0, 0.0);
+    let pieces = [Piece::Ball(0.04, Point3::origin()), Piece::Ball(0.04, other)];
+    let config = Config { grazing: -0.3, ..Config::default() };
+    let scene = Scene::new(&record, &pieces, turn, 12);
+    let query = scene.query(&record, false);
+    let result = directional::recognise(&scene.views(), &query, &config);
+    let found = match &result {
+        Ok(found) => found,
+        Err(refusal) => refusal.best_guess().unwrap(),
+    };
+    for ball in [scene.truth * Point3::origin(), scene.truth * other] {
+        let others = found.alternatives.iter().map(|other| other.pose);
+        let near = |pose: &Transform| (pose.translation.vector - ball.coords).norm() < 0.006;
+        assert!(others.chain([found.pose.pose]).any(|pose| near(&pose)), "{ball}: {found:?}");
+    }
+}
