@@ -141,12 +141,34 @@ impl Camera {
         )
     }
 
-    /// Pixel of a point in the optical frame (metres); `None` behind or on the camera plane.
+    /// Whether the radial distortion grows all the way out to an undistorted normalised place. Further
+    /// out the polynomial folds back and puts what is far outside of the picture into it.
+    pub fn is_one_to_one(&self, x: f64, y: f64) -> bool {
+        let d = &self.distortion;
+        let r2 = x * x + y * y;
+        // Derivative of r (1 + k1 r^2 + k2 r^4 + k3 r^6) by r, and where it is the least over r^2.
+        let grows = |s: f64| 1.0 + s * (3.0 * d.k1 + s * (5.0 * d.k2 + s * 7.0 * d.k3)) > 0.0;
+        let (a, b, c) = (21.0 * d.k3, 10.0 * d.k2, 3.0 * d.k1);
+        let root = (b * b - 4.0 * a * c).sqrt();
+        let turns = match a == 0.0 {
+            true => [-c / b, f64::NAN],
+            false => [(-b + root) / (2.0 * a), (-b - root) / (2.0 * a)],
+        };
+        // What is not a number is no such place.
+        grows(r2) && turns.into_iter().all(|s| !(s > 0.0 && s < r2) || grows(s))
+    }
+
+    /// Pixel of a point in the optical frame (metres); `None` behind or on the camera plane, and
+    /// further out than the lens's model holds ([`Camera::is_one_to_one`]).
     pub fn project(&self, p_optical: &Point3<f64>) -> Option<Point2<f64>> {
         if p_optical.z <= 1e-9 {
             return None;
         }
-        let (x, y) = self.distort(p_optical.x / p_optical.z, p_optical.y / p_optical.z);
+        let (x, y) = (p_optical.x / p_optical.z, p_optical.y / p_optical.z);
+        if !self.distortion.is_none() && !self.is_one_to_one(x, y) {
+            return None;
+        }
+        let (x, y) = self.distort(x, y);
         Some(Point2::new(self.fx * x + self.cx, self.fy * y + self.cy))
     }
 
@@ -235,6 +257,28 @@ mod tests {
     fn behind_the_camera_is_no_pixel() {
         assert!(lens().project(&Point3::new(0.1, 0.1, -1.0)).is_none());
         assert!(lens().project(&Point3::new(0.1, 0.1, 0.0)).is_none());
+    }
+
+    #[test]
+    fn what_the_lens_folds_back_is_no_pixel() {
+        // One that falls for good, one that grows again further out, two that never fold.
+        for (k1, k2, k3, folds) in [
+            (-0.3, 0.0, 0.0, true),
+            (-0.6, 0.1, 0.0, true),
+            (-0.3, 0.1, -0.02, true),
+            (-0.28, 0.07, 0.0, false),
+            (0.1, 0.0, 5.0, false),
+        ] {
+            let distortion = Distortion { k1, k2, k3, ..Distortion::default() };
+            let camera = Camera { distortion, ..lens() };
+            let at = |k: i32| camera.project(&Point3::new(0.01 * f64::from(k), 0.0, 1.0));
+            let pixels: Vec<Option<f64>> = (0..500).map(|k| at(k).map(|p| p.x)).collect();
+            let seen = pixels.iter().take_while(|p| p.is_some()).count();
+            assert_eq!(seen < 500, folds);
+            assert!(pixels[..seen].windows(2).all(|w| w[0] < w[1]));
+            assert!(pixels[seen..].iter().all(Option::is_none));
+            assert!(seen > 50);
+        }
     }
 
     #[test]

@@ -129,7 +129,8 @@ pub struct Trace<'a> {
     pub sites: Vec<Site>,
 }
 
-/// The object's pose from the edges of one or more pictures, its rotation unknown.
+/// The object's pose from the edges of one or two pictures, its rotation unknown. Of more pictures the
+/// first two that can show the object count.
 pub fn recognise(views: &[View], query: &Query, config: &Config) -> Result<ObjectPose, Refusal> {
     recognise_traced(views, query, config).map_or_else(Err, |(result, _)| result)
 }
@@ -249,7 +250,6 @@ fn prepare<'a>(
     let around = around(query, landmark, half);
     views
         .iter()
-        .take(equations::VIEWS)
         .filter_map(|view| {
             let optical_from_base = view.base_from_optical.inverse();
             let p = optical_from_base * query.landmark.position;
@@ -274,6 +274,7 @@ fn prepare<'a>(
             let straight = view.camera.distortion.is_none();
             Some(Sight { view: *view, optical_from_base, straight, coarse, fine, field })
         })
+        .take(equations::VIEWS)
         .collect()
 }
 

@@ -205,7 +205,8 @@ fn grid_covariance(
     landmark: &Vector3<f64>,
     config: &Config,
 ) -> Matrix6<f64> {
-    let step = if query.up.is_some() { config.turn_step } else { config.grid_spacing };
+    let upright = query.up.is_some() && query.standing != Some(false);
+    let step = if upright { config.turn_step } else { config.grid_spacing };
     let turn = Matrix3::identity() * (step * step);
     // centre = landmark - R lever: a turn w shifts it by -w x (R lever) = [R lever]x w.
     let lever = skew(&(pose.rotation * landmark));

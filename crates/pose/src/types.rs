@@ -2,7 +2,7 @@
 
 use nalgebra::{DMatrix, Matrix3, Point3, Unit, UnitQuaternion, Vector3};
 use vergence_geometry::gaussian::difference;
-use vergence_geometry::{Camera, GaussianPoint, GaussianPose, Symmetry, Transform};
+use vergence_geometry::{Camera, CameraError, GaussianPoint, GaussianPose, Symmetry, Transform};
 use vergence_imaging::Image;
 use vergence_tag::{Record, Shape};
 
@@ -172,6 +172,14 @@ pub enum Refusal {
         /// What the camera says.
         camera: (usize, usize),
     },
+    /// A camera's numbers are not usable.
+    #[error("the camera of picture {view} is not usable: {source}")]
+    BadCamera {
+        /// Which picture, from zero.
+        view: usize,
+        /// What is wrong with it.
+        source: CameraError,
+    },
     /// The record has no such landmark, or one without a direction.
     #[error("the record has no usable landmark {0}")]
     NoLandmark(usize),
@@ -250,9 +258,10 @@ pub(crate) fn check(
     for (view, v) in views.iter().enumerate() {
         let picture = (v.image.width(), v.image.height());
         let camera = (v.camera.width, v.camera.height);
-        if picture != camera || v.camera.validate().is_err() {
+        if picture != camera {
             return Err(Refusal::Size { view, picture, camera });
         }
+        v.camera.validate().map_err(|source| Refusal::BadCamera { view, source })?;
     }
     query.record.validate()?;
     let site = query.landmark_in_object().ok_or(Refusal::NoLandmark(query.landmark_index))?;

@@ -95,13 +95,13 @@ impl Field {
 
     /// Sum over a segment (level pixels) of the mean distance that chance would give minus the
     /// distance read, in pixels times pixels of length; positive speaks for the segment. Parts
-    /// outside the level do not count. Also the length that did count.
-    pub fn evidence(&self, from: (f32, f32), to: (f32, f32)) -> (f32, f32) {
+    /// outside the level do not count.
+    pub fn evidence(&self, from: (f32, f32), to: (f32, f32)) -> f32 {
         let (dx, dy) = (to.0 - from.0, to.1 - from.1);
         if !(dx.is_finite() && dy.is_finite()) {
-            return (0.0, 0.0);
+            return 0.0;
         }
-        let Some(tables) = &self.tables else { return (0.0, 0.0) };
+        let Some(tables) = &self.tables else { return 0.0 };
         let length = (dx * dx + dy * dy).sqrt();
         let (half, slot) = home(nearest_direction(dx, dy));
         let swap = |p: (f32, f32)| if half == 0 { (p.1, p.0) } else { p };
@@ -175,7 +175,7 @@ impl Table {
     }
 
     /// [`Field::evidence`] of ends as row and column.
-    fn evidence(&self, slot: usize, from: (f32, f32), to: (f32, f32), length: f32) -> (f32, f32) {
+    fn evidence(&self, slot: usize, from: (f32, f32), to: (f32, f32), length: f32) -> f32 {
         let ((mut r0, c0), (mut r1, c1)) = (from, to);
         if r0 > r1 {
             (r0, r1) = (r1, r0);
@@ -188,17 +188,25 @@ impl Table {
         let (first, end) = (nearest(r0).max(0), nearest(r1));
         let last = (end - 1).max(first).min(last_row);
         if end < 0 || last < first {
-            return (0.0, 0.0);
+            return 0.0;
         }
-        let (first, last) = (first as usize, last as usize);
+        let (mut first, mut last) = (first as usize, last as usize);
+        let inside = |row: usize| (0..self.cols as i32).contains(&(line + shift[row]));
+        // What leaves the level at the side counts as far as it is within.
+        while first < last && !inside(first) {
+            first += 1;
+        }
+        while first < last && !inside(last) {
+            last -= 1;
+        }
+        if !inside(first) {
+            return 0.0;
+        }
         let [from, to] = [first, last].map(|row| (row, line + shift[row]));
-        if [from.1, to.1].iter().any(|col| !(0..self.cols as i32).contains(col)) {
-            return (0.0, 0.0);
-        }
         let sum = self.between(slot, from, to);
         let rows = (last - first + 1) as f32;
         let counted = length * (rows / (r1 - r0).max(rows)).min(1.0);
-        ((mean - f32::from(sum) / rows) * counted / f32::from(UNIT), counted)
+        (mean - f32::from(sum) / rows) * counted / f32::from(UNIT)
     }
 }
 
@@ -381,12 +389,34 @@ mod tests {
             let sum: f32 = pixels.iter().map(|p| field.value(direction, p.0, p.1)).sum();
             let length = pixels.len() as f32;
             let at = |p: (usize, usize)| (p.0 as f32, p.1 as f32);
-            let (evidence, counted) = field.evidence(at(from), at(to));
-            assert!((counted - length).abs() < 1e-3, "{counted} of {length}");
+            let evidence = field.evidence(at(from), at(to));
             let (half, slot) = home(direction);
             let mean = field.tables.as_ref().unwrap()[half].slots[slot].mean / f32::from(UNIT);
             let expected = mean * length - sum;
             assert!((evidence - expected).abs() < 1e-2, "{evidence} for {expected}");
+        }
+    }
+
+    #[test]
+    fn a_segment_that_leaves_the_level_counts_as_far_as_it_is_within() {
+        let (width, height) = (45, 33);
+        let field = Field::new(&strewn(40, width, height), width, height);
+        // Along either diagonal, out to either side.
+        for (inside, outside) in [((20.0, 12.0), 40.0), ((24.0, 20.0), -40.0)] {
+            for lean in [1.0f32, -1.0] {
+                let end = |by: f32| (inside.0 + by, inside.1 + lean * by);
+                let whole = field.evidence(inside, end(outside));
+                // As far as the nearest border.
+                let sides = [
+                    if outside > 0.0 { 44.0 - inside.0 } else { inside.0 },
+                    if (outside > 0.0) == (lean > 0.0) { 32.0 - inside.1 } else { inside.1 },
+                ];
+                let within = outside.signum() * sides[0].min(sides[1]);
+                let part = field.evidence(inside, end(within));
+                // A pixel more or less at the border may read up to the cap.
+                assert!((whole - part).abs() < 2.0 * CAP_PX, "{whole} for {part}");
+                assert!(whole != 0.0);
+            }
         }
     }
 }

@@ -76,7 +76,7 @@ struct Scratch {
 
 impl Sight<'_> {
     /// Where a point of the optical frame appears on the working scale; not a number when it
-    /// is behind the camera.
+    /// does not.
     fn place(&self, p: &Vector3<f64>) -> (f32, f32) {
         let camera = &self.view.camera;
         if p.z < 1e-6 {
@@ -84,7 +84,11 @@ impl Sight<'_> {
         }
         let inverse = 1.0 / p.z;
         let (x, y) = (p.x * inverse, p.y * inverse);
-        let (x, y) = if self.straight { (x, y) } else { camera.distort(x, y) };
+        let (x, y) = match self.straight {
+            true => (x, y),
+            false if camera.is_one_to_one(x, y) => camera.distort(x, y),
+            false => return (f32::NAN, f32::NAN),
+        };
         let (u, v) = self.coarse.from_picture(camera.fx * x + camera.cx, camera.fy * y + camera.cy);
         (u as f32, v as f32)
     }
@@ -213,7 +217,7 @@ impl Search<'_> {
             for line in &scratch.outline.lines {
                 let [from, to] = line.ends.map(|k| scratch.pixels[usize::from(k)]);
                 let weight = if line.kind == Kind::Crease { CREASE_WEIGHT } else { 1.0 };
-                sum += weight * sight.field.evidence(from, to).0;
+                sum += weight * sight.field.evidence(from, to);
             }
         }
         sum

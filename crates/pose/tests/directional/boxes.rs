@@ -165,6 +165,10 @@ fn nonsense_is_refused_by_name() {
     views[1].base_from_optical.translation.x = f64::NAN;
     let result = directional::recognise(&views, &query, &config);
     assert_eq!(result, Err(Refusal::BadPlace { view: 1 }));
+    let mut views = scene.views();
+    views[1].camera.fx = 0.0;
+    let result = directional::recognise(&views, &query, &config);
+    assert!(matches!(result, Err(Refusal::BadCamera { view: 1, .. })), "{result:?}");
 }
 
 #[test]
