@@ -48,6 +48,8 @@ pub enum Scenario {
     Occluded,
     /// The object "cup" stands within the arm's reach.
     Reach,
+    /// Tagged objects rest on any side that they can, as if they had been dropped.
+    Fallen,
 }
 
 /// Camera model.

@@ -1,8 +1,8 @@
 //! Composes the scene: table, room, lamps, tagged objects and clutter, chosen by the seed.
 //!
-//! Promises: nothing interpenetrates; every tagged object stands on the table, its landmark faces
-//! the heads and is in line of sight of both; at the heads' rest it is outside both pictures; in the
-//! scenario "occluded" something hides a part of the cup but not its landmark; in the scenario "reach"
+//! Promises: nothing interpenetrates; every tagged object stands on the table (in the scenario "fallen"
+//! on any of its sides), its landmark faces the heads and is in line of sight of both; at the heads'
+//! rest it is outside both pictures; in the scenario "occluded" something hides a part of the cup but not its landmark; in the scenario "reach"
 //! the first object called cup stands where the arm reaches it.
 
 use std::ops::Range;
@@ -20,10 +20,12 @@ use crate::scene::{Body, Emitter, Material, Scene};
 use crate::trace::{LANES, Placed, Solid, Texture, V3, is_clear};
 
 mod bodies;
+mod rest;
 mod room;
 
 pub use bodies::object_bodies;
 use bodies::{clutter_solid, material};
+use rest::Rest;
 use room::room;
 
 /// Extent of the table top (m, base): x from, x to, |y| up to.
@@ -34,6 +36,8 @@ const FIELD: [f64; 3] = [0.42, 1.05, 0.6];
 const REACH: [f64; 4] = [0.45, 0.78, -0.3, 0.15];
 /// The disc on the table that the arm's pedestal takes: x, y, radius (m).
 const PEDESTAL: [f64; 3] = [0.2, -0.38, 0.1];
+/// Cosine between a fallen object's landmark and the way to an eye, at least.
+const SHINES: f64 = 0.3;
 /// Attempts to find a place for one thing before giving up.
 const ATTEMPTS: usize = 1000;
 /// Arrangements that are begun before giving up.
@@ -110,13 +114,13 @@ fn compose_once(
     let mut builder = Builder {
         scene: room(&config.light, &mut rng),
         taken: Vec::new(),
-        reach: config.scenario == Scenario::Reach,
+        scenario: config.scenario,
         views: *views,
         eyes: views.map(|v| Point3::from(v.base_from_optical.translation.vector)),
         housing: config.led.housing,
         clutter: Vec::new(),
     };
-    if builder.reach {
+    if config.scenario == Scenario::Reach {
         builder.taken.push(PEDESTAL);
     }
     let (mut objects, mut bodies_of) = (Vec::new(), Vec::new());
@@ -159,8 +163,7 @@ struct Builder {
     scene: Scene,
     /// Discs on the table that are taken: x, y, radius (m).
     taken: Vec<[f64; 3]>,
-    /// The cup stands within the arm's reach.
-    reach: bool,
+    scenario: Scenario,
     views: [RestView; 2],
     eyes: [Point3<f64>; 2],
     housing: bool,
@@ -196,45 +199,55 @@ impl Builder {
         })
     }
 
+    /// True when an object's landmarks shine at both eyes.
+    fn is_faced(&self, object: &TaggedObject) -> bool {
+        object.record.landmarks.iter().all(|site| {
+            let (place, normal) = (object.landmark(site), object.normal(site));
+            self.eyes.iter().all(|eye| normal.dot(&(eye - place).normalize()) > SHINES)
+        })
+    }
+
     fn place_object(
         &mut self,
         settings: &ObjectSettings,
         rng: &mut Pcg64Mcg,
     ) -> Result<TaggedObject, SimError> {
         let record = &settings.record;
-        let [w, l, h] = record.bounding_box.sides();
-        let mut radius = 0.5 * w.hypot(l);
-        if settings.handle {
-            radius += 0.35 * h;
-        }
-        let near = self.reach && record.object_id.as_str() == "cup";
+        let near = self.scenario == Scenario::Reach && record.object_id.as_str() == "cup";
         let [x0, x1, y0, y1] = if near { REACH } else { [FIELD[0], FIELD[1], -FIELD[2], FIELD[2]] };
         for _ in 0..ATTEMPTS {
             let [x, y] =
                 settings.at.unwrap_or_else(|| [rng.random_range(x0..x1), rng.random_range(y0..y1)]);
+            let rest = match self.scenario {
+                Scenario::Fallen => Rest::any(settings, rng),
+                _ => Rest::upright(settings),
+            };
+            let radius = rest.radius;
             // The first landmark's azimuth, turned towards the heads and off by up to 35 degrees.
             let normal = record.landmarks.first().map_or([1.0, 0.0, 0.0], |site| site.normal);
-            let facing = (-y).atan2(-x) - normal[1].atan2(normal[0]);
+            let normal = rest.turn * Vector3::from(normal);
+            let facing = (-y).atan2(-x) - normal.y.atan2(normal.x);
             let yaw = match settings.yaw_deg {
                 Some(degrees) => degrees.to_radians(),
                 None => facing + rng.random_range(-0.6..0.6),
             };
             let base_from_object = Transform::from_parts(
-                Translation3::new(x, y, 0.5 * h),
-                UnitQuaternion::from_euler_angles(0.0, 0.0, yaw),
+                Translation3::new(x, y, rest.height),
+                UnitQuaternion::from_euler_angles(0.0, 0.0, yaw) * rest.turn,
             );
             let object = TaggedObject { record: record.clone(), base_from_object };
             let fixed = settings.at.is_some();
             let fits = self.free(x, y, radius)
                 && (fixed
                     || self.unseen_at_rest(
-                        &Point3::new(x, y, 0.5 * h),
+                        &Point3::new(x, y, rest.height),
                         0.5 * record.bounding_box.diagonal(),
                     ))
                 && record
                     .landmarks
                     .iter()
-                    .all(|site| fixed || self.in_sight(&object.landmark(site)));
+                    .all(|site| fixed || self.in_sight(&object.landmark(site)))
+                && (self.scenario != Scenario::Fallen || self.is_faced(&object));
             if fits {
                 let bodies = object_bodies(settings, &base_from_object, self.housing, rng)?;
                 self.scene.bodies.extend(bodies);

@@ -1,6 +1,6 @@
 //! Stereo pictures of one tagged object with its truth, for measuring pose recognition in bulk.
 //!
-//! In: a seed. Out: two pictures of a random box, can or cup among clutter, taken by heads that
+//! In: a seed. Out: two pictures of a random box, can or cup (fallen: or ball) among clutter, taken by heads that
 //! have turned to its landmark; the record, the landmark as a triangulation would report it, and the
 //! true pose. The light is dark in the pictures. Cameras are exact: what the head does not know is
 //! in the landmark's error.
@@ -50,7 +50,7 @@ pub fn stereo_scene(scenario: Scenario, seed: u64) -> Result<StereoScene, SimErr
     sim.scenario = scenario;
     sim.light.status_hz = 0.0;
     sim.led.housing = rng.random::<bool>();
-    sim.objects = vec![random_object(&mut rng)];
+    sim.objects = vec![random_object(scenario, &mut rng)];
     let mut chains = Vec::new();
     for side in vergence_devices::Side::BOTH {
         chains.push(description.chain("base", &config.head(side).optical_frame)?);
@@ -118,19 +118,24 @@ fn triangulated(
     GaussianPoint { position: landmark + error, covariance }
 }
 
-/// A box, can or cup of everyday size with its landmark on the side.
-fn random_object(rng: &mut Pcg64Mcg) -> ObjectSettings {
+/// A box, can or cup, or where things have fallen a ball too, of everyday size with its landmark on the
+/// side.
+fn random_object(scenario: Scenario, rng: &mut Pcg64Mcg) -> ObjectSettings {
     let surfaces = [Surface::Plain, Surface::Printed, Surface::Striped, Surface::Speckled];
     let surface = surfaces[rng.random_range(0..surfaces.len())];
     // Rounded to the millimetre, as a record would be written.
     let mut size = |low: f64, high: f64| (1e3 * rng.random_range(low..high)).round() / 1e3;
-    let kind = size(0.0, 3.0) as u32;
+    let kind = size(0.0, if scenario == Scenario::Fallen { 4.0 } else { 3.0 }) as u32;
     let height = size(0.05, 0.14);
     let (shape, sides, normal) = match kind {
         0 => (Shape::Box, [size(0.05, 0.14), size(0.04, 0.1), height], Vector3::x()),
         1 => {
             let diameter = size(0.05, 0.09);
             (Shape::Cylinder { diameter, height }, [diameter, diameter, height], Vector3::x())
+        }
+        3 => {
+            let diameter = size(0.05, 0.1);
+            (Shape::Sphere { diameter }, [diameter; 3], Vector3::x())
         }
         _ => {
             let top_diameter = size(0.06, 0.09);
@@ -141,7 +146,7 @@ fn random_object(rng: &mut Pcg64Mcg) -> ObjectSettings {
         }
     };
     let normal = normal.normalize();
-    let z = size(-0.1, 0.35) * height;
+    let z = if kind == 3 { 0.0 } else { size(-0.1, 0.35) * height };
     let radius = match shape {
         Shape::Cup { top_diameter, bottom_diameter, .. } => {
             0.25 * (top_diameter + bottom_diameter)

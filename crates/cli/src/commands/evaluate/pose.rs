@@ -31,6 +31,9 @@ pub struct Pose {
     /// Seed of the first scene; the others follow.
     #[arg(long, default_value_t = 0)]
     seed: u64,
+    /// Draw objects on any side that they can rest on, balls among them, instead of standing ones.
+    #[arg(long, conflicts_with = "set")]
+    fallen: bool,
     /// How to recognise.
     #[arg(long, value_enum, default_value_t = Method::Directional)]
     method: Method,
@@ -74,7 +77,7 @@ pub fn run(args: &Pose) -> Result<bool, Failure> {
             Some(folders) => {
                 folders.par_iter().map(|(id, folder)| recorded(*id, folder, args.method)).collect()
             }
-            None => seeds.into_par_iter().map(|seed| simulated(seed, args.method)).collect(),
+            None => seeds.into_par_iter().map(|seed| simulated(seed, args)).collect(),
         }
     });
     let figures = Figures::of(&outcomes?);
@@ -94,9 +97,10 @@ fn recorded(id: u32, folder: &Path, method: Method) -> Result<(Outcome, f64), Fa
 }
 
 /// The same of a simulated one.
-fn simulated(seed: u64, method: Method) -> Result<(Outcome, f64), Failure> {
-    let scene = stereo_scene(Scenario::Default, seed)
-        .map_err(|e| Failure::failed(e, "take another --seed"))?;
+fn simulated(seed: u64, args: &Pose) -> Result<(Outcome, f64), Failure> {
+    let scenario = if args.fallen { Scenario::Fallen } else { Scenario::Default };
+    let scene =
+        stereo_scene(scenario, seed).map_err(|e| Failure::failed(e, "take another --seed"))?;
     let views = [0, 1].map(|k| View {
         image: &scene.images[k],
         camera: scene.cameras[k],
@@ -110,7 +114,7 @@ fn simulated(seed: u64, method: Method) -> Result<(Outcome, f64), Failure> {
         up: Some(Vector3::z_axis()),
         standing: None,
     };
-    Ok(recognise(seed, &views, &query, &scene.base_from_object, method))
+    Ok(recognise(seed, &views, &query, &scene.base_from_object, args.method))
 }
 
 fn recognise(
