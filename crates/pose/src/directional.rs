@@ -82,6 +82,8 @@ pub struct Config {
     /// Poses that differ by more than this turn (rad), or are as far apart as a turn by this about the
     /// object's middle moves its furthest corner, count as different in the verdict.
     pub different: f64,
+    /// So do those that are further apart than this (m), however large the object.
+    pub different_place: f64,
     /// Share of the contour that must lie on edges.
     pub least_coverage: f64,
     /// Evidence against chance (nats) below which the best pose is refused: odds as against other
@@ -109,6 +111,7 @@ impl Default for Config {
             grazing: 0.1,
             distinct: 2f64.to_radians(),
             different: 12f64.to_radians(),
+            different_place: 0.01,
             least_coverage: 0.55,
             least_evidence: 2.2,
             least_confidence: 0.9,
@@ -150,13 +153,13 @@ pub fn recognise_traced<'a>(
     let search = Search::new(&sights, &model, query, (landmark, normal), config);
     let hypotheses = search.hypotheses();
     let rough = hypotheses.iter().map(|h| search.refine_roughly(&h.pose, h.rests)).collect();
-    let rough = search.ranked(rough, config.distinct);
+    let rough = search.ranked(rough, |a, b| search.are_alike(a, b, config.distinct, f64::INFINITY));
     let fine = search.finalists(rough).into_iter().map(|r| search.refine_finely(r)).collect();
-    let mut fine = search.ranked(fine, config.different);
+    let mut fine = search.ranked(fine, |a, b| search.is_same(a, b));
     if let Some(twins) = fine.first().map(|best| search.twins(&best.0)) {
         fine.extend(twins);
     }
-    let mut different = search.ranked(fine, config.different);
+    let mut different = search.ranked(fine, |a, b| search.is_same(a, b));
     if let Some(best) = different.first_mut() {
         search.settle(best);
     }
@@ -338,17 +341,22 @@ impl Search<'_> {
         (refined, explained)
     }
 
-    /// Best first, without those that are [`Search::alike`] a better one.
+    /// Whether two poses are one answer to the verdict.
+    fn is_same(&self, a: &Transform, b: &Transform) -> bool {
+        self.are_alike(a, b, self.config.different, self.config.different_place)
+    }
+
+    /// Best first, without those that are alike a better one.
     fn ranked(
         &self,
         mut found: Vec<(Refined, Explained)>,
-        apart: f64,
+        alike: impl Fn(&Transform, &Transform) -> bool,
     ) -> Vec<(Refined, Explained)> {
         found.sort_by(|a, b| b.1.evidence.total_cmp(&a.1.evidence));
         let mut kept: Vec<(Refined, Explained)> = Vec::new();
         for candidate in found {
             let pose = &candidate.0.pose;
-            if kept.iter().all(|k| !self.alike(&k.0.pose, pose, apart)) {
+            if kept.iter().all(|k| !alike(&k.0.pose, pose)) {
                 kept.push(candidate);
             }
         }
@@ -366,7 +374,7 @@ impl Search<'_> {
             .near_symmetries(self.model)
             .into_iter()
             .map(|s| of.pose * s)
-            .filter(|p| !self.alike(p, &of.pose, self.config.different))
+            .filter(|p| !self.is_same(p, &of.pose))
             .filter(stands)
             .map(|pose| {
                 let mut twin = Refined { pose, ..of.without_sites() };

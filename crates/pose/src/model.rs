@@ -22,8 +22,10 @@ use revolution::Frustum;
 /// What makes a contour segment visible.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// The outline: object on one side, whatever is behind on the other.
+    /// The outline where a face ends: object on one side, whatever is behind on the other.
     Silhouette,
+    /// The outline where a curved wall turns away smoothly.
+    Limb,
     /// An edge between two visible faces of the object; its contrast may be poor.
     Crease,
     /// The open rim of a cup: a lip of unknown thickness, of which the outer or the inner edge may be
@@ -40,8 +42,8 @@ pub struct Segment {
     pub to: Vector3<f64>,
     /// What it is.
     pub kind: Kind,
-    /// Outward normal of the face that turns away there, for silhouettes where it is flat: an
-    /// object that rests on that face has a shadow, not a background, on the other side.
+    /// Outward normal of the flat face that turns away at a silhouette, or of the wall at a limb: where
+    /// an object rests on that face or line there is a shadow, not a background, on the other side.
     pub away: Option<Vector3<f64>>,
     /// Which part of the body it lies on: the same number means the same edge of a polyhedron, rim
     /// or side of a wall for every eye.

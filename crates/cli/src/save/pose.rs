@@ -60,7 +60,7 @@ fn outline(
     let project =
         |p: &Vector3<f64>| view.camera.project(&(optical_from_object * nalgebra::Point3::from(*p)));
     for segment in &contour {
-        let colour = if segment.kind == Kind::Silhouette { silhouette } else { crease };
+        let colour = if segment.kind == Kind::Crease { crease } else { silhouette };
         if let (Some(from), Some(to)) = (project(&segment.from), project(&segment.to)) {
             canvas.line(on_canvas(&from), on_canvas(&to), colour);
         }

@@ -88,9 +88,9 @@ fn piece_of(site: &Site) -> u32 {
     (site.along / PIECE) as u32
 }
 
-/// Part and kind: what errs together.
+/// Part, kind and whether it is in contact: what errs together.
 pub(super) fn part_of(site: &Site) -> u32 {
-    3 * u32::from(site.part) + site.kind as u32
+    8 * u32::from(site.part) + 2 * site.kind as u32 + u32::from(site.contact)
 }
 
 /// Normal equations while they are summed: of all unknowns, then of one part's own.

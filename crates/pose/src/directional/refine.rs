@@ -38,10 +38,12 @@ const STANDING_SD: f64 = 0.006;
 /// Beyond this tilt (rad) an object is not taken to stand.
 const STANDING_LIMIT: f64 = 0.05;
 
-/// Probability that a visible contour shows no edge: occluded or without contrast.
-pub fn absence(kind: Kind) -> f64 {
-    match kind {
-        Kind::Silhouette | Kind::Rim => 0.2,
+/// Probability that a visible contour shows no edge of its own: occluded, without contrast or, below a
+/// wall that turns away, in shadow, whose edge is the one that shows.
+pub fn absence(site: &Site) -> f64 {
+    match site.kind {
+        Kind::Limb if site.contact => 0.6,
+        Kind::Silhouette | Kind::Limb | Kind::Rim => 0.2,
         Kind::Crease => 0.45,
     }
 }
@@ -327,7 +329,7 @@ fn assign(
     sd: f64,
 ) -> impl Iterator<Item = (bool, f64, f64)> {
     let common = site.offset_sd() * site.px_per_metre;
-    let missing = absence(site.kind);
+    let missing = absence(site);
     let edges = if site.inner.is_some() { 2.0 } else { 1.0 };
     let density = (1.0 - missing) / (edges * (2.0 * std::f64::consts::PI).sqrt());
     // Likelihood, its weighted residual and its weight, for either edge.

@@ -256,28 +256,29 @@ impl Search<'_> {
         }
     }
 
-    /// The first `count` of a sorted list that are not [`Search::alike`] an earlier one.
-    fn distinct(&self, sorted: &[Hypothesis], count: usize, apart: f64) -> Vec<Hypothesis> {
+    /// The first `count` of a sorted list that are not within a turn (rad) of an earlier one.
+    fn distinct(&self, sorted: &[Hypothesis], count: usize, turn: f64) -> Vec<Hypothesis> {
         let mut kept: Vec<Hypothesis> = Vec::with_capacity(count);
         for h in sorted {
             if kept.len() == count {
                 break;
             }
-            if kept.iter().all(|k| !self.alike(&k.pose, &h.pose, apart)) {
+            if kept.iter().all(|k| !self.are_alike(&k.pose, &h.pose, turn, f64::INFINITY)) {
                 kept.push(*h);
             }
         }
         kept
     }
 
-    /// Whether two poses differ by no more than this turn (rad), and are no further from each other
-    /// than such a turn about the object's middle moves its corners. Of symmetric twins the nearest.
-    pub(super) fn alike(&self, a: &Transform, b: &Transform, apart: f64) -> bool {
-        if self.symmetry.angle_between(&a.rotation, &b.rotation) > apart {
+    /// Whether two poses differ by no more than a turn (rad), and are no further from each other than
+    /// such a turn about the object's middle moves its corners, nor than so far (m). Of symmetric twins
+    /// the nearest counts.
+    pub(super) fn are_alike(&self, a: &Transform, b: &Transform, turn: f64, far: f64) -> bool {
+        if self.symmetry.angle_between(&a.rotation, &b.rotation) > turn {
             return false;
         }
         let reach = 0.5 * Vector3::from(self.query.record.bounding_box.sides()).norm();
         let near = self.symmetry.nearest(b, a);
-        (near.translation.vector - a.translation.vector).norm() <= apart * reach
+        (near.translation.vector - a.translation.vector).norm() <= far.min(turn * reach)
     }
 }

@@ -25,6 +25,8 @@ const CREASE_SD: f64 = 0.0006;
 const RIM_SD: f64 = 0.0008;
 /// Foot of a standing object: contact shadows hide where it ends.
 const CONTACT_SD: f64 = 0.0015;
+/// Outline of a wall that turns away below: where it lies, its own shadow begins before it ends.
+const BELLY_SD: f64 = 0.004;
 
 /// Most edges kept at a site.
 pub const CANDIDATES: usize = 4;
@@ -76,19 +78,17 @@ pub struct Site {
     pub part: u16,
     /// How far along the part (m).
     pub along: f64,
-    /// Silhouette or crease.
+    /// What it is.
     pub kind: Kind,
     /// Picture pixel.
     pub pixel: (f64, f64),
-    /// The outline of a curved wall, where the surface turns away smoothly.
-    pub limb: bool,
     /// Unit normal in the picture.
     pub normal: (f64, f64),
     /// Contour length that the site stands for (picture px).
     pub length: f64,
     /// Size of a metre across the line of sight there (px).
     pub px_per_metre: f64,
-    /// The foot of a standing object, where its shadow begins.
+    /// The foot of a standing object, or a wall that turns away below: where its shadow begins.
     pub contact: bool,
     /// Shift of the contour along the normal by the shared unknowns (px per unit), the lip's aside.
     pub by_shared: ByShared,
@@ -114,10 +114,11 @@ impl Site {
     /// Deviation of the whole part's edge from where the record has it, on the object (m).
     pub fn offset_sd(&self) -> f64 {
         match (self.contact, self.kind) {
+            (true, Kind::Limb) => BELLY_SD,
             (true, _) => CONTACT_SD,
             (false, Kind::Crease) => CREASE_SD,
             (false, Kind::Rim) => RIM_SD,
-            (false, Kind::Silhouette) if self.limb => LIMB_SD,
+            (false, Kind::Limb) => LIMB_SD,
             (false, Kind::Silhouette) => FORM_SD,
         }
     }
@@ -193,7 +194,10 @@ pub fn sites(
         }
         let stands_for = std::mem::take(&mut since);
         let contact = match (segment.away, up_in_object) {
-            (Some(away), Some(up)) => away.dot(&up) < -CONTACT_COS,
+            (Some(away), Some(up)) => {
+                let least = if segment.kind == Kind::Limb { BELLY_COS } else { CONTACT_COS };
+                away.dot(&up) < -least
+            }
             _ => false,
         };
         // A contour that passes close by the camera, or is bent outwards by the lens, may be endless.
@@ -216,7 +220,7 @@ pub fn sites(
             if (normal * (pixel - middle)).x < 0.0 {
                 normal = -normal;
             }
-            let swells = segment.kind == Kind::Silhouette && !contact;
+            let swells = matches!(segment.kind, Kind::Silhouette | Kind::Limb) && !contact;
             let pixel = if swells { pixel + normal.transpose() * state.form.y } else { pixel };
             let across = normal * by_point;
             let by_base = across * optical_from_base;
@@ -237,7 +241,6 @@ pub fn sites(
             let mut site = Site {
                 view,
                 part: segment.part,
-                limb: segment.kind == Kind::Silhouette && segment.away.is_none(),
                 along: segment.along + share * (segment.to - segment.from).norm(),
                 kind: segment.kind,
                 pixel: (pixel.x, pixel.y),
@@ -265,6 +268,8 @@ const MOST_ACROSS: f64 = 3.0;
 const LEAST_SPACING: f64 = 0.5;
 /// Cosine above which a face that turns away counts as the one that the object rests on.
 const CONTACT_COS: f64 = 0.99;
+/// The same for a wall that turns away: more of it than the line it rests on is in its shadow.
+const BELLY_COS: f64 = 0.4;
 
 /// Local extrema of the slope along the normal. A blurred step's slope is a Gaussian, so a parabola
 /// through the logarithms of three samples has its top in the right place; one through the samples
@@ -335,7 +340,6 @@ impl Site {
             along: 0.0,
             kind: Kind::Silhouette,
             pixel: (100.0, 100.0),
-            limb: false,
             normal: (1.0, 0.0),
             length: 2.0,
             px_per_metre: 1000.0,

@@ -96,7 +96,7 @@ fn part_evidence(part: &[Site], sd_px: f64, density: f64) -> f64 {
     for sites in part.chunks(PRODUCT) {
         product.fill([[1.0; GRID]; 3]);
         for site in sites {
-            let missing = absence(site.kind);
+            let missing = absence(site);
             let scale = (1.0 - missing) / density;
             let outer = likelihoods(site, 0.0, sd_px, scale);
             let inner = site.inner.map(|place| (place, likelihoods(site, place, sd_px, scale)));

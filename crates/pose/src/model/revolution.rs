@@ -66,8 +66,8 @@ impl Frustum {
                 out.points.push((self.top * direction).push(self.half_height));
                 out.points.push((self.bottom * direction).push(-self.half_height));
                 let ends = [first, first + 1];
-                let part = side as u16;
-                out.lines.push(Line { ends, kind: Kind::Silhouette, away: None, part, along: 0.0 });
+                let (away, part) = (Some(direction.push(-slope).normalize()), side as u16);
+                out.lines.push(Line { ends, kind: Kind::Limb, away, part, along: 0.0 });
             }
         }
     }
@@ -175,7 +175,9 @@ pub(super) fn sphere_outline(radius: f64, eye: &Vector3<f64>, chords: usize, out
         let ends = [k, (k + 1) % chords as u16];
         let along = r * TAU * f64::from(k) / chords as f64;
         let part = ARCS * k / chords as u16;
-        out.lines.push(Line { ends, kind: Kind::Silhouette, away: None, part, along });
+        let middle = out.points[usize::from(ends[0])] + out.points[usize::from(ends[1])];
+        let away = Some(middle.normalize());
+        out.lines.push(Line { ends, kind: Kind::Limb, away, part, along });
     }
 }
 
@@ -193,8 +195,11 @@ mod tests {
         let limbs: Vec<_> = out.iter().filter(|s| (s.from.z - s.to.z).abs() > 0.05).collect();
         assert_eq!(limbs.len(), 2);
         for limb in limbs {
+            let normal = limb.away.unwrap();
             let azimuth = limb.from.y.atan2(limb.from.x);
-            let normal = Vector3::new(azimuth.cos(), azimuth.sin(), -0.2);
+            let across = Vector3::new(azimuth.cos(), azimuth.sin(), -0.2).normalize();
+            assert!((normal - across).norm() < 1e-12);
+            assert_eq!(limb.kind, Kind::Limb);
             for p in [limb.from, limb.to] {
                 assert!(normal.dot(&(eye - p)).abs() < 1e-12, "{}", normal.dot(&(eye - p)));
             }
