@@ -4,7 +4,7 @@ use nalgebra::{Matrix3, Point3, UnitQuaternion, Vector3};
 use vergence_geometry::{Camera, GaussianPoint, Transform};
 use vergence_imaging::Image;
 use vergence_pose::{Query, View, canny, directional, distance, paper};
-use vergence_tag::Record;
+use vergence_tag::{Record, Shape};
 
 fn main() {
     divan::main();
@@ -18,10 +18,17 @@ fn image() -> Image<u8> {
     })
 }
 
-fn with_scene<R>(up: bool, f: impl FnOnce(&[View], &Query) -> R) -> R {
+fn record() -> Record {
     let text = r#"{"object_id": "box", "landmarks": [{"position": [0, 0, 0.05], "normal": [0, 0, 1]}],
         "bounding_box": {"width": 0.2, "length": 0.2, "height": 0.1}, "shape": {"kind": "box"}}"#;
-    let record: Record = serde_json::from_str(text).unwrap_or_else(|e| panic!("{e}"));
+    serde_json::from_str(text).unwrap_or_else(|e| panic!("{e}"))
+}
+
+fn with_scene<R>(up: bool, f: impl FnOnce(&[View], &Query) -> R) -> R {
+    with_object(&record(), up, f)
+}
+
+fn with_object<R>(record: &Record, up: bool, f: impl FnOnce(&[View], &Query) -> R) -> R {
     let image = image();
     let down = UnitQuaternion::from_euler_angles(std::f64::consts::PI, 0.0, 0.0);
     let views = [0.1, -0.1].map(|x| View {
@@ -35,10 +42,7 @@ fn with_scene<R>(up: bool, f: impl FnOnce(&[View], &Query) -> R) -> R {
         covariance: Matrix3::identity() * 1e-5,
     };
     let up = up.then(Vector3::z_axis);
-    f(
-        &views,
-        &Query { record: &record, landmark, landmark_index: 0, up, standing: up.map(|_| true) },
-    )
+    f(&views, &Query { record, landmark, landmark_index: 0, up, standing: up.map(|_| true) })
 }
 
 #[divan::bench]
@@ -52,6 +56,32 @@ fn directional_any_attitude(bencher: divan::Bencher) {
 fn directional_standing(bencher: divan::Bencher) {
     with_scene(true, |views, query| {
         bencher.bench_local(|| directional::recognise(views, query, &Default::default()));
+    });
+}
+
+/// A star of twelve points: every piece of its edges may be hidden by any of its faces.
+#[divan::bench]
+fn directional_concave(bencher: divan::Bencher) {
+    let corner = |k: usize| {
+        let (angle, radius) =
+            (std::f64::consts::TAU * k as f64 / 24.0, if k.is_multiple_of(2) { 0.1 } else { 0.06 });
+        [radius * angle.cos(), radius * angle.sin()]
+    };
+    let outline = (0..24).map(corner).collect();
+    let record = Record { shape: Shape::Prism { outline, height: 0.1 }, ..record() };
+    with_object(&record, false, |views, query| {
+        bencher.bench_local(|| directional::recognise(views, query, &Default::default()));
+    });
+}
+
+#[divan::bench]
+fn track(bencher: divan::Bencher) {
+    with_scene(false, |views, query| {
+        let last = Transform::from_parts(
+            Vector3::new(0.002, -0.001, 0.0).into(),
+            UnitQuaternion::from_euler_angles(0.02, -0.01, 0.03),
+        );
+        bencher.bench_local(|| directional::track(views, query, &last, &Default::default()));
     });
 }
 

@@ -174,7 +174,8 @@ pub enum Invalid {
     /// The form does not fill its bounding box (to within 2 mm).
     #[error("shape does not fit the bounding box")]
     ShapeOutsideBox,
-    /// Fewer corners than a solid needs, or a polygon that does not run counter-clockwise.
+    /// Fewer corners than a solid needs, corners in one place, or a polygon that crosses itself or does
+    /// not run counter-clockwise.
     #[error("{0} does not describe a solid")]
     Degenerate(&'static str),
 }
@@ -259,7 +260,7 @@ impl Record {
                     .map(|i| (outline[i], outline[(i + 1) % n]))
                     .map(|(a, b)| a[0] * b[1] - a[1] * b[0])
                     .sum();
-                if n < 3 || area2 <= 0.0 {
+                if n < 3 || area2 <= 0.0 || !is_simple(outline) {
                     return Err(Invalid::Degenerate("shape.outline"));
                 }
                 let [x, y] = [0, 1].map(|k| extent(outline.iter().map(|c| c[k])));
@@ -269,13 +270,71 @@ impl Record {
                 for vertex in vertices {
                     finite("shape.vertices", vertex)?;
                 }
-                if vertices.len() < 4 {
+                if vertices.len() < 4 || are_flat(vertices) {
                     return Err(Invalid::Degenerate("shape.vertices"));
                 }
                 fits([0, 1, 2].map(|k| extent(vertices.iter().map(|v| v[k]))))
             }
         }
     }
+}
+
+/// Corners nearer than this (m) are one, and what is no thicker is flat.
+const THIN: f64 = 1e-6;
+
+/// Whether no edge of a polygon is a point and no two meet but neighbours at their corner.
+fn is_simple(outline: &[[f64; 2]]) -> bool {
+    let n = outline.len();
+    let corner = |i: usize| outline[i % n];
+    // Twice the area of a triangle, positive when it runs counter-clockwise.
+    let turn = |a: [f64; 2], b: [f64; 2], c: [f64; 2]| {
+        (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+    };
+    // Whether a point in line with the ends of an edge lies between them.
+    let between = |a: [f64; 2], b: [f64; 2], c: [f64; 2]| {
+        (0..2).all(|k| c[k] >= a[k].min(b[k]) && c[k] <= a[k].max(b[k]))
+    };
+    let long = |i: usize| (0..2).any(|k| (corner(i)[k] - corner(i + 1)[k]).abs() > THIN);
+    let meet = |i: usize, j: usize| {
+        let (a, b, c, d) = (corner(i), corner(i + 1), corner(j), corner(j + 1));
+        let of_first = [turn(a, b, c), turn(a, b, d)];
+        let of_second = [turn(c, d, a), turn(c, d, b)];
+        let crosses = |t: [f64; 2]| (t[0] > 0.0) != (t[1] > 0.0) && t[0] != 0.0 && t[1] != 0.0;
+        (crosses(of_first) && crosses(of_second))
+            || (of_first[0] == 0.0 && between(a, b, c))
+            || (of_first[1] == 0.0 && between(a, b, d))
+            || (of_second[0] == 0.0 && between(c, d, a))
+            || (of_second[1] == 0.0 && between(c, d, b))
+    };
+    // Neighbours share a corner; they may not run back on each other.
+    let runs_back = |i: usize| {
+        let (a, b, c) = (corner(i), corner(i + 1), corner(i + 2));
+        let ahead: f64 = (0..2).map(|k| (b[k] - a[k]) * (c[k] - b[k])).sum();
+        turn(a, b, c) == 0.0 && ahead < 0.0
+    };
+    let apart = |i: usize, j: usize| j > i + 1 && (j + 1) % n != i;
+    (0..n).all(|i| long(i) && !runs_back(i) && (0..n).all(|j| !apart(i, j) || !meet(i, j)))
+}
+
+/// Whether all points lie in one plane.
+fn are_flat(points: &[[f64; 3]]) -> bool {
+    let from =
+        |i: usize, j: usize| -> [f64; 3] { core::array::from_fn(|k| points[j][k] - points[i][k]) };
+    let cross = |a: [f64; 3], b: [f64; 3]| -> [f64; 3] {
+        core::array::from_fn(|k| {
+            let (l, m) = ((k + 1) % 3, (k + 2) % 3);
+            a[l] * b[m] - a[m] * b[l]
+        })
+    };
+    let dot = |a: [f64; 3], b: [f64; 3]| -> f64 { (0..3).map(|k| a[k] * b[k]).sum() };
+    let longest = |a: &[f64; 3], b: &[f64; 3]| dot(*a, *a).total_cmp(&dot(*b, *b));
+    // The widest triangle with the first point says which plane it would be.
+    let n = points.len();
+    let Some(along) = (1..n).map(|i| from(0, i)).max_by(longest) else { return true };
+    let normals = (1..n).map(|i| cross(along, from(0, i)));
+    let Some(normal) = normals.max_by(longest) else { return true };
+    let length = libm_sqrt(dot(normal, normal));
+    (1..n).all(|i| dot(normal, from(0, i)).abs() <= THIN * length)
 }
 
 /// Side of a centred bounding interval of these values: twice the largest magnitude.
@@ -367,5 +426,42 @@ mod tests {
         let mut record = cup();
         record.shape = Shape::Prism { outline: flat, height: 0.09 };
         assert_eq!(record.validate(), Err(Invalid::Degenerate("shape.outline")));
+    }
+
+    #[test]
+    fn what_encloses_nothing_is_no_solid() {
+        let of_outline = |corners: &[[f64; 2]]| {
+            let mut record = cup();
+            let outline = heapless::Vec::from_slice(corners).unwrap();
+            record.shape = Shape::Prism { outline, height: 0.09 };
+            record.validate()
+        };
+        let a = 0.04;
+        let square = [[-a, -a], [a, -a], [a, a], [-a, a]];
+        assert_eq!(of_outline(&square), Ok(()));
+        // A corner within an edge does no harm; a notch neither.
+        assert_eq!(of_outline(&[[-a, -a], [0.0, -a], [a, -a], [a, a], [-a, a]]), Ok(()));
+        assert_eq!(of_outline(&[[-a, -a], [a, -a], [a, a], [0.0, 0.0], [-a, a]]), Ok(()));
+        let refused = Err(Invalid::Degenerate("shape.outline"));
+        for outline in [
+            // Crossing itself, a corner twice, touching itself, running back on itself.
+            &[[-a, -a], [a, -a], [a, a], [-a, 0.0], [0.0, -0.03], [-a, a]][..],
+            &[[-a, -a], [a, -a], [a, -a], [a, a], [-a, a]],
+            &[[-a, -a], [a, -a], [a, a], [0.0, -a], [-a, a]],
+            &[[-a, -a], [a, -a], [a, a], [a, 0.0], [-a, a]],
+        ] {
+            assert_eq!(of_outline(outline), refused, "{outline:?}");
+        }
+        let of_corners = |corners: &[[f64; 3]]| {
+            let mut record = cup();
+            record.shape = Shape::Convex { vertices: heapless::Vec::from_slice(corners).unwrap() };
+            record.validate()
+        };
+        let (b, h) = (-0.045, 0.045);
+        let solid = [[-a, -a, b], [a, -a, b], [a, a, h], [-a, a, b]];
+        assert_eq!(of_corners(&solid), Ok(()));
+        let flat = Err(Invalid::Degenerate("shape.vertices"));
+        assert_eq!(of_corners(&[[-a, -a, b], [a, -a, b], [a, a, h], [-a, a, h]]), flat);
+        assert_eq!(of_corners(&[[-a, -a, b], [a, a, h], [0.0; 3], [0.01, 0.01, 0.01125]]), flat);
     }
 }

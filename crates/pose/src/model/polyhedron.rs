@@ -120,6 +120,10 @@ impl Polyhedron {
                 }
             }
         }
+        // Between two faces of one plane, as at a corner within an edge of a prism's outline, there is
+        // nothing to see.
+        let bends = |e: &Edge| (faces[e.faces[0]].normal - faces[e.faces[1]].normal).norm() > WELD;
+        edges.retain(bends);
         Polyhedron { vertices, faces, edges, convex }
     }
 
@@ -344,6 +348,17 @@ mod tests {
         let eye = Vector3::new(0.8, -1.0, 1.2);
         for kind in [Kind::Silhouette, Kind::Crease] {
             assert!((lengths(&body, eye, kind) - lengths(&hull, eye, kind)).abs() < 1e-12);
+        }
+    }
+
+    #[test]
+    fn a_corner_within_an_edge_shows_nothing() {
+        let outline = [[-0.1, -0.1], [0.0, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]];
+        let body = Polyhedron::prism(&outline, 0.3);
+        let square = Polyhedron::cuboid(Vector3::new(0.2, 0.2, 0.3));
+        let eye = Vector3::new(0.3, -1.0, 0.6);
+        for kind in [Kind::Silhouette, Kind::Crease] {
+            assert!((lengths(&body, eye, kind) - lengths(&square, eye, kind)).abs() < 1e-12);
         }
     }
 
