@@ -1,9 +1,10 @@
-//! `vergence pose`: recognise the object in every scene of a pose set, write a BOP results CSV.
+//! `vergence pose`: recognise the object of every tag in a pose set, write a BOP results CSV.
 
 pub mod set;
 mod table;
 
 use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
 use std::time::Instant;
 
 use clap::{Args, ValueEnum};
@@ -11,7 +12,8 @@ use vergence_imaging::codec;
 use vergence_pose::{ObjectPose, Query, Refusal, View, directional, paper};
 
 use crate::failure::Failure;
-use set::Scene;
+use crate::save::{cannot_write, unwritten};
+use set::{Case, Purpose};
 
 /// Recognise objects of known size in a set of pictures (BOP multi-sensor layout).
 #[derive(Args)]
@@ -53,75 +55,88 @@ impl Method {
     }
 }
 
-/// What came of one scene.
+/// What came of one case of the set.
 pub struct Outcome {
-    /// Its number.
-    pub id: u32,
+    /// The scene's number.
+    pub scene: u32,
+    /// The image's number in the scene.
+    pub image: u32,
     /// The object's number in the set.
     pub object: u32,
     /// Pose, or why there is none.
     pub result: Result<ObjectPose, Refusal>,
     /// `base_from_optical` of the left camera.
     pub base_from_left: vergence_geometry::Transform,
-    /// Seconds for all pictures of the scene, decoding them aside.
+    /// Seconds for this object in all pictures of the image, decoding them aside.
     pub seconds: f64,
 }
 
-/// Runs the command; `true` when at least one scene was answered.
+/// Runs the command; `true` when at least one object was answered.
 pub fn run(args: PoseArgs) -> Result<bool, Failure> {
-    let folders = set::scenes(&args.set)?;
-    let outcomes: Result<Vec<Outcome>, Failure> = pool(args.threads)?.install(|| {
-        use rayon::prelude::*;
-        folders.par_iter().map(|(id, folder)| recognise(*id, folder, &args)).collect()
-    });
-    let outcomes = outcomes?;
-    table::write(&args.out, &outcomes)?;
-    table::summary(&outcomes, &args.out);
-    Ok(outcomes.iter().any(|o| o.result.is_ok()))
+    table::check(&args.out)?;
+    let pictures = args.save.as_deref().map(Pictures::create).transpose()?;
+    let worked = set::each(&args.set, args.threads, Purpose::Answers, |case| {
+        Ok(recognise(case, args.method, pictures.as_ref()))
+    })?;
+    if !worked.results.is_empty() {
+        table::write(&args.out, &worked.results)?;
+        table::summary(&worked.results, &args.out);
+    }
+    worked.whole()?;
+    pictures.map_or(Ok(()), Pictures::finish)?;
+    Ok(worked.results.iter().any(|o| o.result.is_ok()))
 }
 
-/// Threads for as many scenes at a time; at least one.
-pub fn pool(threads: usize) -> Result<rayon::ThreadPool, Failure> {
-    let builder = rayon::ThreadPoolBuilder::new().num_threads(threads.max(1));
-    builder.build().map_err(|e| Failure::failed(e, "ask for fewer --threads"))
-}
-
-fn recognise(id: u32, folder: &Path, args: &PoseArgs) -> Result<Outcome, Failure> {
-    let scene = Scene::read(folder)?;
-    let (views, query) = (scene.views(), scene.query());
+fn recognise(case: &Case, method: Method, pictures: Option<&Pictures>) -> Outcome {
+    let (views, query) = (case.views(), case.query());
     let start = Instant::now();
-    let result = args.method.recognise(&views, &query);
+    let result = method.recognise(&views, &query);
     let seconds = start.elapsed().as_secs_f64();
-    if let Some(folder) = &args.save {
-        save_pictures(folder, id, &views, &query, args.method)?;
+    if let Some(pictures) = pictures {
+        pictures.save(case, &views, &query, method);
     }
     let base_from_left = views[0].base_from_optical;
-    Ok(Outcome { id, object: scene.object, result, base_from_left, seconds })
+    let (scene, image, object) = (case.scene, case.image, case.object());
+    Outcome { scene, image, object, result, base_from_left, seconds }
 }
 
-/// Writes the pictures of one scene; the recognition runs once more, so that the time stays pure.
-fn save_pictures(
-    folder: &Path,
-    id: u32,
-    views: &[View],
-    query: &Query,
-    method: Method,
-) -> Result<(), Failure> {
-    let hint = "name a folder that can be written to";
-    std::fs::create_dir_all(folder)
-        .map_err(|e| Failure::misuse(format!("{}: {e}", folder.display()), hint))?;
-    let pictures = match method {
-        Method::Directional => {
-            match directional::recognise_traced(views, query, &directional::Config::default()) {
-                Ok((_, trace)) => directional::picture::draw(&trace),
-                Err(_) => Vec::new(),
+/// Pictures of what was seen, in a folder.
+struct Pictures {
+    folder: PathBuf,
+    /// First thing that could not be written; told at the end, the results come first.
+    failed: OnceLock<Failure>,
+}
+
+impl Pictures {
+    fn create(folder: &Path) -> Result<Self, Failure> {
+        std::fs::create_dir_all(folder).map_err(|error| cannot_write(folder, error))?;
+        Ok(Pictures { folder: folder.into(), failed: OnceLock::new() })
+    }
+
+    /// Writes the pictures of one case; the recognition runs once more, so that the time stays pure.
+    fn save(&self, case: &Case, views: &[View], query: &Query, method: Method) {
+        let pictures = match method {
+            Method::Directional => {
+                match directional::recognise_traced(views, query, &directional::Config::default()) {
+                    Ok((_, trace)) => directional::picture::draw(&trace),
+                    Err(_) => Vec::new(),
+                }
+            }
+            Method::Paper => paper::draw(views, query, &paper::Config::default()),
+        };
+        let of = match case.first {
+            true => format!("{:06}", case.scene),
+            false => format!("{:06}-{:06}-{}", case.scene, case.image, case.position),
+        };
+        for (name, canvas) in pictures {
+            let path = self.folder.join(format!("{of}-{name}.png"));
+            if let Err(error) = codec::write_canvas(&path, &canvas) {
+                let _ = self.failed.set(unwritten(error));
             }
         }
-        Method::Paper => paper::draw(views, query, &paper::Config::default()),
-    };
-    for (name, canvas) in pictures {
-        let path = folder.join(format!("{id:06}-{name}.png"));
-        codec::write_canvas(&path, &canvas).map_err(|e| Failure::misuse(e, hint))?;
     }
-    Ok(())
+
+    fn finish(self) -> Result<(), Failure> {
+        self.failed.into_inner().map_or(Ok(()), Err)
+    }
 }

@@ -171,7 +171,8 @@ fn centred(frame: &Frame, seen: &[Point2<f64>]) -> Canvas {
     canvas
 }
 
-fn unwritten(error: CodecError) -> Failure {
+/// What is said of a picture that could not be written; the error names it.
+pub fn unwritten(error: CodecError) -> Failure {
     Failure::failed(error, "check the folder given with --save: is it writable, is the disk full?")
 }
 

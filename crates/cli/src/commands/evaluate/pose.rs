@@ -5,17 +5,19 @@
 //! figure but those of honesty counts a refusal as wrong.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Instant;
 
 use clap::Args;
 use nalgebra::Vector3;
+use rayon::prelude::*;
 use serde_json::json;
 use vergence_geometry::{Symmetry, Transform};
 use vergence_pose::{ObjectPose, Query, Refusal, View};
 use vergence_sim::{Scenario, stereo_scene};
 
-use crate::commands::pose::{Method, pool, set};
+use crate::commands::pose::Method;
+use crate::commands::pose::set::{self, Purpose, Worked};
 use crate::failure::Failure;
 use crate::output::outln;
 
@@ -45,7 +47,7 @@ pub struct Pose {
     json: bool,
 }
 
-/// What came of one scene.
+/// What came of one object.
 enum Outcome {
     Answer(Answer),
     /// Why there is none, without the numbers.
@@ -69,34 +71,35 @@ pub fn run(args: &Pose) -> Result<bool, Failure> {
         let what = format!("--scenes {} is not between 1 and 100000", args.scenes);
         return Err(Failure::misuse(what, "give a number in that range"));
     }
-    let folders = args.set.as_deref().map(set::scenes).transpose()?;
-    let outcomes: Result<Vec<(Outcome, f64)>, Failure> = pool(args.threads)?.install(|| {
-        use rayon::prelude::*;
-        let seeds = args.seed..args.seed.saturating_add(args.scenes);
-        match folders {
-            Some(folders) => {
-                folders.par_iter().map(|(id, folder)| recorded(*id, folder, args.method)).collect()
-            }
-            None => seeds.into_par_iter().map(|seed| simulated(seed, args)).collect(),
-        }
-    });
-    let figures = Figures::of(&outcomes?);
+    let worked = match &args.set {
+        Some(set) => set::each(set, args.threads, Purpose::Comparison, |case| {
+            let truth = case.truth()?;
+            Ok(recognise(case.scene.into(), &case.views(), &case.query(), &truth, args.method))
+        })?,
+        None => simulation(args)?,
+    };
+    if worked.results.is_empty() {
+        worked.whole()?;
+    }
+    let figures = Figures::of(&worked);
     if args.json {
         outln!("{}", figures.document(args));
     } else {
         figures.print(args);
     }
+    worked.whole()?;
     Ok(figures.answered > 0)
 }
 
-/// One scene of a set, with the seconds that its recognition took.
-fn recorded(id: u32, folder: &Path, method: Method) -> Result<(Outcome, f64), Failure> {
-    let scene = set::Scene::read(folder)?;
-    let truth = scene.truth(folder)?;
-    Ok(recognise(id.into(), &scene.views(), &scene.query(), &truth, method))
+/// Every simulated scene, with the seconds that its recognition took.
+fn simulation(args: &Pose) -> Result<Worked<(Outcome, f64)>, Failure> {
+    let seeds = args.seed..args.seed.saturating_add(args.scenes);
+    let results: Result<Vec<(Outcome, f64)>, Failure> = set::pool(args.threads)?
+        .install(|| seeds.into_par_iter().map(|seed| simulated(seed, args)).collect());
+    Ok(Worked { results: results?, scenes: args.scenes as usize, bad: BTreeMap::new() })
 }
 
-/// The same of a simulated one.
+/// One of them.
 fn simulated(seed: u64, args: &Pose) -> Result<(Outcome, f64), Failure> {
     let scenario = if args.fallen { Scenario::Fallen } else { Scenario::Default };
     let scene =
@@ -169,6 +172,10 @@ impl Answer {
 /// What the command prints.
 struct Figures {
     scenes: usize,
+    /// Scenes that could not be read whole.
+    bad: Vec<u32>,
+    /// What was to be recognised: one in every simulated scene, in a set what its tags name.
+    objects: usize,
     answered: usize,
     within_5: f64,
     within_2: f64,
@@ -185,7 +192,8 @@ struct Figures {
 }
 
 impl Figures {
-    fn of(outcomes: &[(Outcome, f64)]) -> Self {
+    fn of(worked: &Worked<(Outcome, f64)>) -> Self {
+        let outcomes = &worked.results;
         let (mut answers, mut refused) = (Vec::new(), BTreeMap::new());
         for (outcome, _) in outcomes {
             match outcome {
@@ -201,7 +209,9 @@ impl Figures {
             median(answers.iter().map(|a| value(a)).chain(missing))
         };
         Figures {
-            scenes: outcomes.len(),
+            scenes: worked.scenes,
+            bad: worked.bad.keys().copied().collect(),
+            objects: outcomes.len(),
             answered: answers.len(),
             within_5: share(&|a| a.within(5.0, 5.0), outcomes.len()),
             within_2: share(&|a| a.within(2.0, 2.0), outcomes.len()),
@@ -219,6 +229,8 @@ impl Figures {
         let wrong = if args.set.is_some() { "wrong_scenes" } else { "wrong_seeds" };
         json!({
             "scenes": self.scenes,
+            "bad_scenes": self.bad,
+            "objects": self.objects,
             "seed": args.set.is_none().then_some(args.seed),
             "answered": self.answered,
             "within_5mm_5deg": self.within_5,
@@ -235,7 +247,10 @@ impl Figures {
 
     fn print(&self, args: &Pose) {
         match &args.set {
-            Some(set) => outln!("{} scenes of {}", self.scenes, set.display()),
+            Some(set) => {
+                let (objects, scenes, set) = (self.objects, self.scenes, set.display());
+                outln!("{objects} objects in {scenes} scenes of {set}");
+            }
             None => outln!("{} simulated stereo scenes from seed {}", self.scenes, args.seed),
         }
         outln!("answered                          {}", self.answered);

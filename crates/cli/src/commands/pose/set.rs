@@ -1,34 +1,71 @@
 //! A pose set on disk: BOP multi-sensor layout with two grey cameras and the tags' records.
 //!
 //! Read are `scene_camera_*.json`, `scene_tags.json` and the pictures; the truth
-//! (`scene_gt_left.json`) only where answers are compared with it. Lengths on disk are millimetres,
-//! here metres.
+//! (`scene_gt_left.json`) only where answers are compared with it. A scene may hold several images, and an
+//! image several tags: each tag in each image is a case of its own. Lengths on disk are millimetres, here
+//! metres.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use nalgebra::{Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
+use rayon::prelude::*;
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
 use vergence_geometry::{Camera, Distortion, GaussianPoint, Transform};
 use vergence_imaging::{Image, codec};
 use vergence_pose::{Query, View};
-use vergence_tag::Record;
+use vergence_tag::{Record, Shown};
 
 use crate::failure::Failure;
 
 const MM: f64 = 1e-3;
 const LAYOUT_HINT: &str = "docs/pose.md describes the layout of a pose set";
+/// Most by which a number of `cam_K` that must be zero or one may be off: rounding.
+const K_ROUNDING: f64 = 1e-9;
 
-/// One scene: pictures, cameras, and what the robot knows.
-pub struct Scene {
-    /// The object's number in the set.
-    pub object: u32,
-    pictures: Vec<Picture>,
-    record: Record,
-    landmark: GaussianPoint,
-    standing: Option<bool>,
-    gravity_known: bool,
+/// One tag in one image: what is to be recognised.
+pub struct Case<'a> {
+    /// The scene's number.
+    pub scene: u32,
+    /// The image's number in the scene.
+    pub image: u32,
+    /// Which of the image's tags it is, from 0.
+    pub position: usize,
+    /// Nothing comes before it in its scene.
+    pub first: bool,
+    tag: &'a TagEntry,
+    pictures: &'a [Picture],
+    truths: Option<&'a [TruthEntry]>,
+    folder: &'a Path,
+}
+
+/// What a set is read for.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub enum Purpose {
+    /// To answer.
+    Answers,
+    /// To compare answers with the truth.
+    Comparison,
+}
+
+/// What came of the cases of a set.
+pub struct Worked<T> {
+    /// Of those that could be worked on, in order.
+    pub results: Vec<T>,
+    /// Scenes of the set.
+    pub scenes: usize,
+    /// Scenes that could not be read, or not in all of their images, with the first reason.
+    pub bad: BTreeMap<u32, Failure>,
+}
+
+/// A scene's JSON files, by image; the pictures are read one image at a time.
+struct Scene {
+    number: u32,
+    folder: PathBuf,
+    cameras: Vec<(&'static str, BTreeMap<u32, CameraEntry>)>,
+    tags: BTreeMap<u32, Vec<TagEntry>>,
+    truths: Option<BTreeMap<u32, Vec<TruthEntry>>>,
 }
 
 struct Picture {
@@ -36,6 +73,7 @@ struct Picture {
     camera: Camera,
     base_from_optical: Transform,
     turn_sd: f64,
+    pans: bool,
 }
 
 #[derive(Deserialize)]
@@ -66,12 +104,62 @@ struct TagEntry {
 #[derive(Deserialize)]
 #[allow(non_snake_case)]
 struct TruthEntry {
+    obj_id: u32,
     cam_R_m2c: [f64; 9],
     cam_t_m2c: [f64; 3],
 }
 
+/// Works on every case of a set, as many scenes at a time as there are threads. What cannot be read is told
+/// on standard error and stops nothing else.
+pub fn each<T: Send>(
+    set: &Path,
+    threads: usize,
+    purpose: Purpose,
+    work: impl Fn(&Case) -> Result<T, Failure> + Sync,
+) -> Result<Worked<T>, Failure> {
+    let folders = folders(set)?;
+    let of_scene = |(number, folder): &(u32, PathBuf)| {
+        let cases = match Scene::read(*number, folder, purpose) {
+            Ok(scene) => scene.each(&work),
+            Err(failure) => vec![Err(failure)],
+        };
+        for failure in cases.iter().filter_map(|case| case.as_ref().err()) {
+            eprintln!("scene {number}: {}", failure.message);
+        }
+        cases
+    };
+    let all: Vec<Vec<Result<T, Failure>>> =
+        pool(threads)?.install(|| folders.par_iter().map(of_scene).collect());
+    let mut worked = Worked { results: Vec::new(), scenes: folders.len(), bad: BTreeMap::new() };
+    for ((number, _), cases) in folders.iter().zip(all) {
+        for case in cases {
+            match case {
+                Ok(result) => worked.results.push(result),
+                Err(failure) => drop(worked.bad.entry(*number).or_insert(failure)),
+            }
+        }
+    }
+    Ok(worked)
+}
+
+impl<T> Worked<T> {
+    /// What ends the command when its results are told: an error when a scene was bad.
+    pub fn whole(&self) -> Result<(), Failure> {
+        let Some(first) = self.bad.values().next() else { return Ok(()) };
+        let (bad, scenes) = (self.bad.len(), self.scenes);
+        let message = format!("{bad} of {scenes} scenes could not be read whole, as told above");
+        Err(Failure { message, hint: LAYOUT_HINT.into(), status: first.status })
+    }
+}
+
+/// Threads for as many scenes at a time; at least one.
+pub fn pool(threads: usize) -> Result<rayon::ThreadPool, Failure> {
+    let builder = rayon::ThreadPoolBuilder::new().num_threads(threads.max(1));
+    builder.build().map_err(|e| Failure::failed(e, "ask for fewer --threads"))
+}
+
 /// Scene folders of a set with their numbers, in order.
-pub fn scenes(set: &Path) -> Result<Vec<(u32, PathBuf)>, Failure> {
+fn folders(set: &Path) -> Result<Vec<(u32, PathBuf)>, Failure> {
     let test = set.join("test");
     let entries = std::fs::read_dir(&test)
         .map_err(|e| Failure::misuse(format!("{}: {e}", test.display()), LAYOUT_HINT))?;
@@ -87,40 +175,64 @@ pub fn scenes(set: &Path) -> Result<Vec<(u32, PathBuf)>, Failure> {
 }
 
 impl Scene {
-    /// Reads a scene's folder; a scene without a right camera has one picture.
-    pub fn read(folder: &Path) -> Result<Self, Failure> {
-        let (image_id, tags): (String, Vec<TagEntry>) = first(&folder.join("scene_tags.json"))?;
-        let tag = tags.into_iter().next().ok_or_else(|| {
-            bad(&folder.join("scene_tags.json"), "names no tag for its first image")
-        })?;
-        let mut pictures = vec![Picture::read(folder, "left", &image_id)?];
-        let mut gravity_known = pictures[0].1;
-        if folder.join("scene_camera_right.json").exists() {
-            let right = Picture::read(folder, "right", &image_id)?;
-            gravity_known |= right.1;
-            pictures.push(right);
+    /// Reads the JSON files of a scene's folder; without a right camera there is one picture an image.
+    fn read(number: u32, folder: &Path, purpose: Purpose) -> Result<Self, Failure> {
+        let path = folder.join("scene_tags.json");
+        let mut tags: BTreeMap<u32, Vec<TagEntry>> = by_image(&path)?;
+        tags.retain(|_, tags| !tags.is_empty());
+        if tags.is_empty() {
+            return Err(bad(&path, "names no tag"));
         }
-        Ok(Scene {
-            object: tag.obj_id,
-            pictures: pictures.into_iter().map(|(picture, _)| picture).collect(),
-            record: tag.tag,
-            landmark: GaussianPoint {
-                position: Point3::from(Vector3::from(tag.landmark_w) * MM),
-                covariance: Matrix3::from_row_slice(&tag.landmark_cov_w) * (MM * MM),
-            },
-            standing: tag.standing,
-            gravity_known: gravity_known || tag.standing.is_some(),
-        })
+        let mut cameras = Vec::new();
+        for side in ["left", "right"] {
+            let path = camera_path(folder, side);
+            if side == "left" || path.exists() {
+                cameras.push((side, by_image(&path)?));
+            }
+        }
+        let truths = (purpose == Purpose::Comparison).then(|| by_image(&truth_path(folder)));
+        Ok(Scene { number, folder: folder.into(), cameras, tags, truths: truths.transpose()? })
     }
 
-    /// `base_from_object` in truth, of the first object in the left picture.
-    pub fn truth(&self, folder: &Path) -> Result<Transform, Failure> {
-        let path = folder.join("scene_gt_left.json");
-        let (_, objects): (String, Vec<TruthEntry>) = first(&path)?;
-        let object = objects.first().ok_or_else(|| bad(&path, "names no object"))?;
-        let left_from_object = rigid(&object.cam_R_m2c, &object.cam_t_m2c)
-            .ok_or_else(|| bad(&path, "cam_R_m2c is not a rotation, or cam_t_m2c not finite"))?;
-        Ok(self.pictures[0].base_from_optical * left_from_object)
+    /// Works on the scene's cases; of an image that cannot be read there is one failure.
+    fn each<T>(&self, work: impl Fn(&Case) -> Result<T, Failure>) -> Vec<Result<T, Failure>> {
+        let mut results = Vec::new();
+        let first_image = self.tags.keys().next();
+        for (image, tags) in &self.tags {
+            let cameras = self.cameras.iter();
+            let pictures: Result<Vec<Picture>, Failure> = cameras
+                .map(|(side, entries)| Picture::read(&self.folder, side, *image, entries))
+                .collect();
+            let pictures = match pictures {
+                Ok(pictures) => pictures,
+                Err(failure) => {
+                    results.push(Err(failure));
+                    continue;
+                }
+            };
+            let truths = self.truths.as_ref();
+            let truths = truths.map(|t| t.get(image).map_or(&[][..], Vec::as_slice));
+            results.extend(tags.iter().enumerate().map(|(position, tag)| {
+                work(&Case {
+                    scene: self.number,
+                    image: *image,
+                    position,
+                    first: position == 0 && Some(image) == first_image,
+                    tag,
+                    pictures: &pictures,
+                    truths,
+                    folder: &self.folder,
+                })
+            }));
+        }
+        results
+    }
+}
+
+impl Case<'_> {
+    /// The object's number in the set.
+    pub fn object(&self) -> u32 {
+        self.tag.obj_id
     }
 
     /// The pictures as the recogniser wants them, left first.
@@ -138,44 +250,96 @@ impl Scene {
 
     /// What is looked for.
     pub fn query(&self) -> Query<'_> {
+        let tag = self.tag;
+        let gravity_known = tag.standing.is_some() || self.pictures.iter().any(|p| p.pans);
         Query {
-            record: &self.record,
-            landmark: self.landmark,
+            record: &tag.tag,
+            landmark: GaussianPoint {
+                position: Point3::from(Vector3::from(tag.landmark_w) * MM),
+                covariance: Matrix3::from_row_slice(&tag.landmark_cov_w) * (MM * MM),
+            },
             landmark_index: 0,
-            up: self.gravity_known.then(Vector3::z_axis),
-            standing: self.standing,
+            up: gravity_known.then(Vector3::z_axis),
+            standing: tag.standing,
         }
+    }
+
+    /// `base_from_object` in truth. Of several objects of the tag's number it is the one whose landmark lies
+    /// nearest to the tag's.
+    pub fn truth(&self) -> Result<Transform, Failure> {
+        let path = truth_path(self.folder);
+        let mine = |truth: &&TruthEntry| truth.obj_id == self.object();
+        let poses: Result<Vec<Transform>, Failure> = self
+            .truths
+            .unwrap_or_default()
+            .iter()
+            .filter(mine)
+            .map(|truth| {
+                let left_from_object =
+                    rigid(&truth.cam_R_m2c, &truth.cam_t_m2c).ok_or_else(|| {
+                        bad(&path, "cam_R_m2c is not a rotation, or cam_t_m2c not finite")
+                    })?;
+                Ok(self.pictures[0].base_from_optical * left_from_object)
+            })
+            .collect();
+        let query = self.query();
+        let on_object = query
+            .record
+            .landmarks
+            .first()
+            .map_or(Point3::origin(), |landmark| Point3::from(landmark.position));
+        let off = |pose: &Transform| (pose * on_object - query.landmark.position).norm();
+        poses?.into_iter().min_by(|a, b| off(a).total_cmp(&off(b))).ok_or_else(|| {
+            bad(&path, format!("names no object {} in image {}", self.object(), self.image))
+        })
     }
 }
 
 impl Picture {
-    /// Reads one camera and its picture; also whether the camera pans.
-    fn read(folder: &Path, side: &str, image_id: &str) -> Result<(Self, bool), Failure> {
-        let path = folder.join(format!("scene_camera_{side}.json"));
-        let mut cameras: BTreeMap<String, CameraEntry> = json(&path)?;
-        let entry = cameras
-            .remove(image_id)
-            .ok_or_else(|| bad(&path, format!("has no image {image_id}")))?;
-        let image_path = picture_path(folder, side, image_id);
-        let image = codec::read(&image_path)
-            .map_err(|e| Failure::misuse(format!("{}: {e}", image_path.display()), LAYOUT_HINT))?;
-        let k = entry.cam_K;
+    /// Reads one camera's picture of an image.
+    fn read(
+        folder: &Path,
+        side: &str,
+        image: u32,
+        entries: &BTreeMap<u32, CameraEntry>,
+    ) -> Result<Self, Failure> {
+        let path = camera_path(folder, side);
+        let refused = |what: &dyn std::fmt::Display| bad(&path, format!("image {image}: {what}"));
+        let entry = entries.get(&image).ok_or_else(|| refused(&"is not there"))?;
+        let image_path = picture_path(folder, side, image);
+        let image = std::fs::read(&image_path)
+            .map_err(|e| bad(&image_path, e))
+            .and_then(|bytes| codec::decode(&bytes).map_err(|e| bad(&image_path, e)))?;
+        let [fx, skew, cx, skew_y, fy, cy, last @ ..] = entry.cam_K;
+        if [skew, skew_y].iter().any(|v| v.abs() > K_ROUNDING) {
+            return Err(refused(&"cam_K has a skew, which the camera's model does not know"));
+        }
+        if last.iter().zip([0.0, 0.0, 1.0]).any(|(v, want)| (v - want).abs() > K_ROUNDING) {
+            return Err(refused(&"the last row of cam_K is not 0 0 1"));
+        }
+        if entry.turn_sd < 0.0 {
+            return Err(refused(&"turn_sd is negative"));
+        }
         let [k1, k2, p1, p2, k3] = entry.cam_dist.unwrap_or_default();
         let camera = Camera {
             width: image.width(),
             height: image.height(),
-            fx: k[0],
-            fy: k[4],
-            cx: k[2],
-            cy: k[5],
+            fx,
+            fy,
+            cx,
+            cy,
             distortion: Distortion { k1, k2, p1, p2, k3 },
         };
-        camera.validate().map_err(|e| bad(&path, e))?;
-        let base_from_optical = rigid(&entry.cam_R_w2c, &entry.cam_t_w2c)
-            .ok_or_else(|| bad(&path, "cam_R_w2c is not a rotation, or cam_t_w2c not finite"))?;
-        let base_from_optical = base_from_optical.inverse();
-        let turn_sd = entry.turn_sd.abs();
-        Ok((Picture { image, camera, base_from_optical, turn_sd }, entry.pan.is_some()))
+        camera.validate().map_err(|e| refused(&e))?;
+        let optical_from_base = rigid(&entry.cam_R_w2c, &entry.cam_t_w2c)
+            .ok_or_else(|| refused(&"cam_R_w2c is not a rotation, or cam_t_w2c not finite"))?;
+        Ok(Picture {
+            image,
+            camera,
+            base_from_optical: optical_from_base.inverse(),
+            turn_sd: entry.turn_sd,
+            pans: entry.pan.is_some(),
+        })
     }
 }
 
@@ -188,22 +352,35 @@ fn rigid(rotation: &[f64; 9], translation_mm: &[f64; 3]) -> Option<Transform> {
     (sound && t.iter().all(|v| v.is_finite())).then(|| Transform::from_parts(t.into(), rotation))
 }
 
+fn camera_path(folder: &Path, side: &str) -> PathBuf {
+    folder.join(format!("scene_camera_{side}.json"))
+}
+
+fn truth_path(folder: &Path) -> PathBuf {
+    folder.join("scene_gt_left.json")
+}
+
 /// BOP names pictures by six digits; PNG is usual, JPEG is read too.
-fn picture_path(folder: &Path, side: &str, image_id: &str) -> PathBuf {
-    let stem = folder.join(format!("gray_{side}")).join(format!("{image_id:0>6}"));
+fn picture_path(folder: &Path, side: &str, image: u32) -> PathBuf {
+    let stem = folder.join(format!("gray_{side}")).join(format!("{image:06}"));
     let candidates = ["png", "jpg", "jpeg"].map(|e| stem.with_extension(e));
     candidates.iter().find(|p| p.exists()).unwrap_or(&candidates[0]).clone()
 }
 
-fn first<T: DeserializeOwned>(path: &Path) -> Result<(String, T), Failure> {
-    let all: BTreeMap<String, T> = json(path)?;
-    all.into_iter().next().ok_or_else(|| bad(path, "is empty"))
-}
-
-fn json<T: DeserializeOwned>(path: &Path) -> Result<T, Failure> {
-    let text = std::fs::read(path)
-        .map_err(|e| Failure::misuse(format!("{}: {e}", path.display()), LAYOUT_HINT))?;
-    serde_json::from_slice(&text).map_err(|e| bad(path, e))
+/// A JSON file of BOP: its keys are the images' numbers, which have another order than their text.
+fn by_image<T: DeserializeOwned>(path: &Path) -> Result<BTreeMap<u32, T>, Failure> {
+    let text = std::fs::read(path).map_err(|e| bad(path, e))?;
+    let all: BTreeMap<String, T> = serde_json::from_slice(&text).map_err(|e| bad(path, e))?;
+    let mut numbered = BTreeMap::new();
+    for (key, value) in all {
+        let number = key.parse().ok();
+        let new = number.is_some_and(|number| numbered.insert(number, value).is_none());
+        if !new {
+            let key = Shown(&key);
+            return Err(bad(path, format!("\"{key}\" is no image number, or stands there twice")));
+        }
+    }
+    Ok(numbered)
 }
 
 fn bad(path: &Path, what: impl std::fmt::Display) -> Failure {

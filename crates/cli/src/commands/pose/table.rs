@@ -1,13 +1,30 @@
 //! The results: BOP's CSV for scorers, a few lines for people.
 
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
+use std::fs::{self, File};
 use std::path::Path;
 
 use super::Outcome;
 use crate::failure::Failure;
 
-/// Writes the BOP results CSV: one row a scene that was answered, `t` in millimetres.
+/// Refuses a file that cannot be written, before the work; what is in it stays as it is.
+pub fn check(path: &Path) -> Result<(), Failure> {
+    let new = match path.metadata() {
+        // Who reads a pipe would take the trial for its end.
+        Ok(there) if !there.is_file() && !there.is_dir() => return Ok(()),
+        there => there.is_err(),
+    };
+    let opened = File::options().append(true).create(true).open(path);
+    opened
+        .and_then(|_| if new { fs::remove_file(path) } else { Ok(()) })
+        .map_err(|e| refused(path, e))
+}
+
+/// Writes the BOP results CSV: one row an object that was answered, `t` in millimetres. All rows of an image
+/// have its whole time, as BOP wants it.
 pub fn write(path: &Path, outcomes: &[Outcome]) -> Result<(), Failure> {
+    let seconds = seconds(outcomes);
     let mut text = String::from("scene_id,im_id,obj_id,score,R,t,time\n");
     for outcome in outcomes {
         let Ok(found) = &outcome.result else { continue };
@@ -23,35 +40,51 @@ pub fn write(path: &Path, outcomes: &[Outcome]) -> Result<(), Failure> {
             .collect();
         let _ = writeln!(
             text,
-            "{},0,{},{:.6},{},{},{:.6}",
-            outcome.id,
+            "{},{},{},{:.6},{},{},{:.6}",
+            outcome.scene,
+            outcome.image,
             outcome.object,
             found.confidence,
             row_major.join(" "),
             t.join(" "),
-            outcome.seconds,
+            seconds[&(outcome.scene, outcome.image)],
         );
     }
-    std::fs::write(path, text).map_err(|e| {
-        Failure::misuse(format!("{}: {e}", path.display()), "name a file in a folder that exists")
-    })
+    fs::write(path, text).map_err(|e| refused(path, e))
 }
 
 /// Tells people on standard error what came out.
 pub fn summary(outcomes: &[Outcome], path: &Path) {
     for outcome in outcomes {
         if let Err(refusal) = &outcome.result {
-            eprintln!("scene {}: no pose: {refusal}", outcome.id);
+            let Outcome { scene, image, object, .. } = outcome;
+            eprintln!("scene {scene}, image {image}, object {object}: no pose: {refusal}");
         }
     }
     let answered = outcomes.iter().filter(|o| o.result.is_ok()).count();
-    let mut seconds: Vec<f64> = outcomes.iter().map(|o| o.seconds).collect();
+    let mut seconds: Vec<f64> = seconds(outcomes).into_values().collect();
     seconds.sort_by(f64::total_cmp);
     let median = seconds.get(seconds.len() / 2).copied().unwrap_or(f64::NAN);
     eprintln!(
-        "{answered} of {} scenes answered, median {:.1} ms a scene; results in {}",
+        "{answered} of {} objects answered, median {:.1} ms an image; results in {}",
         outcomes.len(),
         1000.0 * median,
         path.display()
     );
+}
+
+/// Seconds for all objects of an image, by scene and image.
+fn seconds(outcomes: &[Outcome]) -> BTreeMap<(u32, u32), f64> {
+    let mut seconds = BTreeMap::new();
+    for outcome in outcomes {
+        *seconds.entry((outcome.scene, outcome.image)).or_default() += outcome.seconds;
+    }
+    seconds
+}
+
+fn refused(path: &Path, error: std::io::Error) -> Failure {
+    Failure::failed(
+        format!("cannot write {}: {error}", path.display()),
+        "give --out a file that can be written, in a folder that exists",
+    )
 }
