@@ -4,6 +4,7 @@ use std::fmt::Arguments;
 use std::io::{ErrorKind, Write};
 
 use serde::Serialize;
+use serde_json::Value;
 
 use crate::failure::Failure;
 
@@ -13,6 +14,25 @@ pub fn json(value: &impl Serialize) -> Result<(), Failure> {
         .map_err(|error| Failure::failed(error, "report this as a defect"))?;
     outln!("{text}");
     Ok(())
+}
+
+/// Under `--json` exit status 1 comes with a document that says why: this prints it for a command that failed
+/// before it had anything to tell. `document` holds what the command's own one says in that case. Misuse is
+/// for the person who typed it.
+pub fn told<T>(
+    result: Result<T, Failure>,
+    as_json: bool,
+    mut document: Value,
+) -> Result<T, Failure> {
+    if let Err(failure) = &result
+        && as_json
+        && failure.status == 1
+    {
+        document["reason"] = failure.message.as_str().into();
+        document["hint"] = failure.hint.as_str().into();
+        json(&document)?;
+    }
+    result
 }
 
 /// `print!` for a reader who may have left.

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use nalgebra::{Point3, Vector3};
 use serde::Serialize;
+use serde_json::json;
 use vergence::{CollectConfig, FindConfig, Session, System};
 use vergence_devices::Side;
 use vergence_head::calibration::{Calibration, CalibrationConfig, middle};
@@ -12,7 +13,7 @@ use vergence_head::{Noise, PanTiltHead};
 
 use crate::failure::Failure;
 use crate::light::{Person, Ruler, SimulatedPerson};
-use crate::output::outln;
+use crate::output::{outln, told};
 use crate::progress::Progress;
 use crate::robot::{BUILT, Opened, RobotArgs, not_urdf, urdf};
 
@@ -102,6 +103,13 @@ pub fn run(args: &Calibrate) -> Result<bool, Failure> {
         ));
     }
     not_urdf(&args.out)?;
+    let outcome = told(calibrate(args), args.json, json!({ "calibrated": false }))?;
+    print(args, &outcome)?;
+    Ok(outcome.calibrated)
+}
+
+/// Measures, and writes what came out if it is good.
+fn calibrate(args: &Calibrate) -> Result<Outcome, Failure> {
     let robot = RobotArgs { config: Some(args.config.clone()), seed: args.seed };
     let mut opened = robot.open()?;
     keeps_what_was_read(args, &opened)?;
@@ -111,7 +119,7 @@ pub fn run(args: &Calibrate) -> Result<bool, Failure> {
     let outcome =
         vergence_head::calibrate(&opened.system.heads, &session.places, &session.lengths, &config);
     let count = |k: usize| session.places.iter().map(|p| p.fixations[k].len()).sum();
-    let mut told = Outcome {
+    let mut summary = Outcome {
         calibrated: outcome.is_ok(),
         reason: outcome.as_ref().err().map(ToString::to_string),
         places: session.places.len(),
@@ -120,11 +128,10 @@ pub fn run(args: &Calibrate) -> Result<bool, Failure> {
         figures: None,
     };
     if let Ok(calibration) = &outcome {
-        told.figures = Some(figures(calibration));
+        summary.figures = Some(figures(calibration));
         write(args, &opened, calibration)?;
     }
-    print(args, &told)?;
-    Ok(told.calibrated)
+    Ok(summary)
 }
 
 /// Looks at the light wherever a person, real or simulated, puts it.

@@ -3,10 +3,11 @@
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
+use serde_json::{Value, json};
 use vergence::{FindConfig, Method, Report};
 
 use crate::failure::Failure;
-use crate::output::outln;
+use crate::output::{outln, told};
 use crate::progress::Progress;
 use crate::robot::{Errors, RobotArgs};
 use crate::save::Saver;
@@ -50,6 +51,21 @@ impl From<MethodArg> for Method {
 
 /// Runs the command.
 pub fn run(args: &Find) -> Result<bool, Failure> {
+    let (report, saver) = told(find(args), args.json, unfound(&args.object))?;
+    // What was found is told first: it must not be lost to a full disk.
+    print(args, &report)?;
+    if let Some(saver) = saver {
+        saver.finish(&report)?;
+    }
+    Ok(report.found)
+}
+
+/// What `--json` says of an object that could not even be looked for; the reason is added.
+pub fn unfound(object: &str) -> Value {
+    json!({ "object_id": object, "found": false, "alternatives": [], "timeline": [] })
+}
+
+fn find(args: &Find) -> Result<(Report, Option<Saver>), Failure> {
     let mut robot = args.robot.open()?;
     let seed = robot.seed(args.robot.seed)?;
     let config = FindConfig { method: args.method.into(), seed, ..FindConfig::default() };
@@ -60,12 +76,7 @@ pub fn run(args: &Find) -> Result<bool, Failure> {
     report.truth = robot.truth(&args.object);
     let (progress, saver) = observer;
     drop(progress);
-    // What was found is told first: it must not be lost to a full disk.
-    print(args, &report)?;
-    if let Some(saver) = saver {
-        saver.finish(&report)?;
-    }
-    Ok(report.found)
+    Ok((report, saver))
 }
 
 fn print(args: &Find, report: &Report) -> Result<(), Failure> {

@@ -3,12 +3,14 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use serde_json::json;
 use vergence::{FindConfig, GraspConfig, Report};
 
+use super::find::unfound;
 use crate::failure::Failure;
-use crate::output::outln;
+use crate::output::{outln, told};
 use crate::progress::Progress;
-use crate::robot::RobotArgs;
+use crate::robot::{Opened, RobotArgs};
 use crate::save::Saver;
 
 /// Find an object, grasp it and lift it.
@@ -28,6 +30,22 @@ pub struct Grasp {
 
 /// Runs the command.
 pub fn run(args: &Grasp) -> Result<bool, Failure> {
+    let mut unfound = unfound(&args.object);
+    unfound["grasp"] = json!({ "succeeded": false });
+    let (report, robot, saver) = told(grasp(args), args.json, unfound)?;
+    // What was done is told first: it must not be lost to a full disk.
+    match args.json {
+        true => crate::output::json(&report)?,
+        false => print(&report),
+    }
+    if let (Some(saver), Some(dir)) = (saver, &args.save) {
+        robot.save_grasp(dir)?;
+        saver.finish(&report)?;
+    }
+    Ok(report.grasp.is_some_and(|grasp| grasp.succeeded))
+}
+
+fn grasp(args: &Grasp) -> Result<(Report, Opened, Option<Saver>), Failure> {
     let mut robot = args.robot.open()?;
     robot.attach_arm(&args.object, args.save.is_some())?;
     let seed = robot.seed(args.robot.seed)?;
@@ -47,16 +65,7 @@ pub fn run(args: &Grasp) -> Result<bool, Failure> {
     }
     let (progress, saver) = observer;
     drop(progress);
-    // What was done is told first: it must not be lost to a full disk.
-    match args.json {
-        true => crate::output::json(&report)?,
-        false => print(&report),
-    }
-    if let (Some(saver), Some(dir)) = (saver, &args.save) {
-        robot.save_grasp(dir)?;
-        saver.finish(&report)?;
-    }
-    Ok(report.grasp.is_some_and(|grasp| grasp.succeeded))
+    Ok((report, robot, saver))
 }
 
 fn print(report: &Report) {

@@ -15,7 +15,7 @@ use vergence_sim::{WiredWorkcell, Workcell, fitting_servo};
 use crate::failure::Failure;
 use crate::interrupt::Interrupt;
 use crate::light::coordinates;
-use crate::output::outln;
+use crate::output::{outln, told};
 use crate::robot::RobotArgs;
 
 /// Offer the simulated workcell's devices over the wires of real ones: servos on a pseudo-terminal,
@@ -51,6 +51,19 @@ pub fn run(args: &Sim) -> Result<bool, Failure> {
             return Err(Failure::misuse("--seconds is not a time", "give a positive number"));
         }
     };
+    let (interrupt, wired) = told(start(args), args.json, json!({}))?;
+    print(args, &wired)?;
+    let lines = args.hold.then(typed);
+    let start = Instant::now();
+    while !interrupt.raised() && lasting.is_none_or(|lasting| start.elapsed() < lasting) {
+        std::thread::sleep(POLL);
+        lines.iter().flat_map(Receiver::try_iter).for_each(|line| hold(&wired, &line));
+    }
+    Ok(true)
+}
+
+/// Offers the devices.
+fn start(args: &Sim) -> Result<(Interrupt, WiredWorkcell), Failure> {
     let failed = |error: std::io::Error| {
         Failure::failed(format!("cannot offer the devices: {error}"), "are ports and ptys free?")
     };
@@ -66,14 +79,7 @@ pub fn run(args: &Sim) -> Result<bool, Failure> {
     if let Some(path) = &args.write_config {
         write_config(&wired, path, &urdf)?;
     }
-    print(args, &wired)?;
-    let lines = args.hold.then(typed);
-    let start = Instant::now();
-    while !interrupt.raised() && lasting.is_none_or(|lasting| start.elapsed() < lasting) {
-        std::thread::sleep(POLL);
-        lines.iter().flat_map(Receiver::try_iter).for_each(|line| hold(&wired, &line));
-    }
-    Ok(true)
+    Ok((interrupt, wired))
 }
 
 /// What is typed, line by line.

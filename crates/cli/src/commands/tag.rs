@@ -5,11 +5,12 @@ use std::time::Duration;
 
 use clap::{Args, Subcommand};
 use serde::Serialize;
+use serde_json::json;
 use vergence_devices::{DeviceError, TagAddress};
 use vergence_tag::{Pattern, Record, Shown, cbor, pattern::Bits};
 
 use crate::failure::Failure;
-use crate::output::outln;
+use crate::output::{outln, told};
 use crate::radio::Radio;
 use crate::robot::RobotArgs;
 use crate::signing;
@@ -183,12 +184,22 @@ fn pair(args: &Pair) -> Result<bool, Failure> {
 }
 
 fn info(args: &Info) -> Result<bool, Failure> {
+    let output = told(ask(args), args.json, json!({}))?;
+    match args.json {
+        true => crate::output::json(&output)?,
+        false => print(&output),
+    }
+    Ok(true)
+}
+
+/// What a tag tells of itself.
+fn ask(args: &Info) -> Result<InfoOutput, Failure> {
     let mut radio = args.robot.open_radio()?;
     let tag = find(&mut radio, &args.id)?;
     let told = radio.link.info(tag, TIMEOUT).map_err(failed)?;
     // A record that is not for everybody is no fault of the tag.
     let record = radio.link.read_record(tag, TIMEOUT).ok();
-    let output = InfoOutput {
+    Ok(InfoOutput {
         address: tag.to_string(),
         manufacturer: told.manufacturer,
         model: told.model,
@@ -198,11 +209,10 @@ fn info(args: &Info) -> Result<bool, Failure> {
         signature: record.map(|bytes| radio.trusted.judge(&bytes).to_string()),
         playing: told.playing,
         rssi: told.rssi,
-    };
-    if args.json {
-        crate::output::json(&output)?;
-        return Ok(true);
-    }
+    })
+}
+
+fn print(output: &InfoOutput) {
     outln!("address   {}", output.address);
     outln!("tag       {} {}", Shown(&output.manufacturer), Shown(&output.model));
     outln!("firmware  {}", Shown(&output.firmware));
@@ -215,7 +225,6 @@ fn info(args: &Info) -> Result<bool, Failure> {
     };
     outln!("record    {record}");
     outln!("light     {}", if output.playing { "plays" } else { "dark" });
-    Ok(true)
 }
 
 fn key(args: &Key) -> Result<bool, Failure> {

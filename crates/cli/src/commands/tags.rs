@@ -4,10 +4,11 @@ use std::time::Duration;
 
 use clap::Args;
 use serde::Serialize;
+use serde_json::json;
 use vergence_tag::{Record, Shown};
 
 use crate::failure::Failure;
-use crate::output::outln;
+use crate::output::{outln, told};
 use crate::radio::Radio;
 use crate::robot::RobotArgs;
 
@@ -47,10 +48,21 @@ struct Tag {
 
 /// Runs the command.
 pub fn run(args: &Tags) -> Result<bool, Failure> {
+    let tags = told(listen(args), args.json, json!({ "tags": [] }))?;
+    let found = !tags.is_empty();
+    match args.json {
+        true => crate::output::json(&Output { tags })?,
+        false => print(&tags),
+    }
+    Ok(found)
+}
+
+/// Who answers.
+fn listen(args: &Tags) -> Result<Vec<Tag>, Failure> {
     let Radio { link: mut radio, trusted, .. } = args.robot.open_radio()?;
     let hint = "check the radio's driver in the configuration";
     let heard = radio.scan(WINDOW).map_err(|error| Failure::failed(error, hint))?;
-    let tags: Vec<Tag> = heard
+    let tags = heard
         .into_iter()
         .map(|tag| {
             let bytes = radio.read_record(tag.address, TIMEOUT).map_err(|error| error.to_string());
@@ -64,12 +76,7 @@ pub fn run(args: &Tags) -> Result<bool, Failure> {
             Tag { id, address, rssi, battery, record: record.ok(), signature, error }
         })
         .collect();
-    let found = !tags.is_empty();
-    match args.json {
-        true => crate::output::json(&Output { tags })?,
-        false => print(&tags),
-    }
-    Ok(found)
+    Ok(tags)
 }
 
 fn print(tags: &[Tag]) {

@@ -51,13 +51,13 @@ struct Row {
     wald: f64,
     median: usize,
     p95: usize,
-    runs: usize,
+    runs: u32,
     undecided: usize,
     wrong: usize,
 }
 
 /// Runs both simulations.
-pub fn run(runs: usize, minutes: f64) -> Result<Bound, Failure> {
+pub fn run(runs: u32, minutes: f64) -> Result<Bound, Failure> {
     let mut frames_to_decision = Vec::new();
     for exposure in [0.15, 1.0] {
         for rho in [1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 20.0] {
@@ -101,10 +101,10 @@ pub fn draw(run: usize, purpose: u64) -> f64 {
     (z >> 11) as f64 / (1u64 << 53) as f64
 }
 
-fn row(rho: f64, exposure: f64, runs: usize) -> Result<Row, Failure> {
+fn row(rho: f64, exposure: f64, runs: u32) -> Result<Row, Failure> {
     let requests = requests()?;
     let (mut counts, mut undecided, mut wrong) = (Vec::new(), 0, 0);
-    for run in 0..runs {
+    for run in 0..runs as usize {
         let own = (draw(run, 1) * requests.len() as f64) as usize;
         let pattern = requests[own].pattern;
         let centre = TILE as f64 / 2.0 - 1.0;

@@ -12,13 +12,18 @@ mod tag_free;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
+use clap::value_parser;
+use serde_json::json;
 use vergence_landmark::{Finder, FinderError, paper, sequential};
 use vergence_ros::recording::{self, RecordingError};
 
 use self::report::Report;
 use self::request::BlinkRequest;
 use crate::failure::Failure;
-use crate::output::{out, outln};
+use crate::output::{out, told};
+
+/// Longest tag-free video that is simulated: a week.
+const MOST_MINUTES: f64 = 10_080.0;
 
 /// How the landmarks are looked for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -42,36 +47,35 @@ pub struct Args {
     #[arg(long, conflicts_with_all = ["recording", "request"], requires = "out")]
     episodes: Option<PathBuf>,
     /// Simulate instead: frames to a decision against Wald's bound, and false alarms
-    #[arg(long, conflicts_with_all = ["recording", "request", "episodes"])]
+    #[arg(long, conflicts_with_all = ["recording", "request", "episodes", "method", "out"])]
     bound: bool,
     /// Runs for every signal-to-noise ratio of --bound
-    #[arg(long, default_value_t = 100, requires = "bound")]
-    runs: usize,
+    #[arg(long, default_value_t = 100, requires = "bound", value_parser = value_parser!(u32).range(1..=100_000))]
+    runs: u32,
     /// Minutes of tag-free video for --bound
-    #[arg(long, default_value_t = 5.0, requires = "bound")]
+    #[arg(long, default_value_t = 5.0, requires = "bound", value_parser = minutes)]
     minutes: f64,
     /// How to look
     #[arg(long, value_enum, default_value = "sequential")]
     method: Method,
     /// Print one JSON document instead of text
-    #[arg(long)]
+    #[arg(long, conflicts_with = "episodes")]
     json: bool,
     /// Write pictures of how each tag was found to this folder
     #[arg(long, conflicts_with_all = ["episodes", "bound"])]
     save: Option<PathBuf>,
-    /// Write the JSON to this file (with --episodes: one file an episode in this folder)
+    /// Write the JSON and the wall time to this file (with --episodes: one file an episode in this folder)
     #[arg(long)]
     out: Option<PathBuf>,
 }
 
-/// Runs the command; `true` when every requested tag is decided.
+/// Runs the command; `true` when of every requested tag it is decided whether it is here.
 pub fn run(args: Args) -> Result<bool, Failure> {
     if args.bound {
-        let bound = bound::run(args.runs, args.minutes)?;
-        if args.json {
-            outln!("{}", serde_json::to_string_pretty(&bound).unwrap_or_default());
-        } else {
-            out!("{}", bound.text());
+        let bound = told(bound::run(args.runs, args.minutes), args.json, json!({}))?;
+        match args.json {
+            true => crate::output::json(&bound)?,
+            false => out!("{}", bound.text()),
         }
         return Ok(true);
     }
@@ -81,19 +85,30 @@ pub fn run(args: Args) -> Result<bool, Failure> {
     let (Some(recording), Some(request)) = (&args.recording, &args.request) else {
         return Err(Failure::misuse("no recording given", "name a recording and --request FILE"));
     };
-    let report = look(recording, request, args.method, args.save.as_deref())?;
-    if let Some(out) = &args.out {
-        write(out, &report.json())?;
+    let looked = look(recording, request, args.method, args.save.as_deref());
+    let report = told(looked, args.json, json!({ "detections": [] }))?;
+    // What was seen is told first: it must not be lost to a full disk.
+    match args.json {
+        true => crate::output::json(&report)?,
+        false => out!("{}", report.text()),
     }
-    if args.json {
-        outln!("{}", report.json());
-    } else {
-        out!("{}", report.text());
+    if let Some(out) = &args.out {
+        write(out, &report)?;
     }
     Ok(report.is_complete())
 }
 
-/// Every episode of a folder; the answers go to `<out>/<episode>.json`.
+/// Minutes of simulated video.
+fn minutes(text: &str) -> Result<f64, String> {
+    let minutes: f64 = text.parse().map_err(|_| "not a number".to_owned())?;
+    match (0.0..=MOST_MINUTES).contains(&minutes) {
+        true => Ok(minutes),
+        false => Err(format!("not between 0 and {MOST_MINUTES}")),
+    }
+}
+
+/// Every episode of a folder; the answers go to `<out>/<episode>.json`. True when of at least
+/// one tag it is decided whether it is there, as the others are counted by who reads the answers.
 fn run_set(set: &Path, out: &Path, method: Method) -> Result<bool, Failure> {
     let unreadable = |e| Failure::misuse(format!("{}: {e}", set.display()), "name a folder");
     let mut episodes: Vec<PathBuf> = std::fs::read_dir(set)
@@ -109,18 +124,20 @@ fn run_set(set: &Path, out: &Path, method: Method) -> Result<bool, Failure> {
     std::fs::create_dir_all(out).map_err(|e| {
         Failure::failed(format!("{}: {e}", out.display()), "name a folder that can be written")
     })?;
+    let mut answered = false;
     for episode in episodes {
         let (recording, request) = (episode.join("recording.mcap"), episode.join("request.json"));
         let report = look(&recording, &request, method, None)?;
         let name = episode.file_name().unwrap_or_default().to_string_lossy().into_owned();
         eprintln!("{name}: {}", report.line());
-        write(&out.join(format!("{name}.json")), &report.json())?;
+        write(&out.join(format!("{name}.json")), &report)?;
+        answered |= report.is_answered();
     }
-    Ok(true)
+    Ok(answered)
 }
 
-fn write(path: &Path, text: &str) -> Result<(), Failure> {
-    std::fs::write(path, text).map_err(|e| {
+fn write(path: &Path, report: &Report) -> Result<(), Failure> {
+    std::fs::write(path, report.timed()).map_err(|e| {
         Failure::failed(format!("{}: {e}", path.display()), "name a file that can be written")
     })
 }

@@ -19,7 +19,17 @@ pub struct Report {
     undecided: Vec<String>,
     /// Frames of the recording.
     frames: usize,
-    /// Wall time of reading and looking (s).
+    /// Wall time of reading and looking (s). It differs from run to run, so that it is no part of what is
+    /// printed.
+    #[serde(skip)]
+    seconds: f64,
+}
+
+/// What a file for scorers holds.
+#[derive(Serialize)]
+struct Timed<'a> {
+    #[serde(flatten)]
+    report: &'a Report,
     seconds: f64,
 }
 
@@ -95,9 +105,15 @@ impl Report {
         self.undecided.is_empty()
     }
 
-    /// One JSON document.
-    pub fn json(&self) -> String {
-        serde_json::to_string_pretty(self).unwrap_or_default()
+    /// Whether any tag is decided.
+    pub fn is_answered(&self) -> bool {
+        !self.detections.is_empty() || !self.absent.is_empty()
+    }
+
+    /// One JSON document with the wall time.
+    pub fn timed(&self) -> String {
+        let timed = Timed { report: self, seconds: self.seconds };
+        serde_json::to_string_pretty(&timed).unwrap_or_default()
     }
 
     /// One line for a table of episodes.

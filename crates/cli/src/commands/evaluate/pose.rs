@@ -19,7 +19,7 @@ use vergence_sim::{Scenario, stereo_scene};
 use crate::commands::pose::Method;
 use crate::commands::pose::set::{self, Purpose, Worked};
 use crate::failure::Failure;
-use crate::output::outln;
+use crate::output::{outln, told};
 
 /// Recognise objects in simulated stereo pairs, or in a pose set, and compare with the truth.
 #[derive(Args)]
@@ -76,7 +76,7 @@ pub fn run(args: &Pose) -> Result<bool, Failure> {
             let truth = case.truth()?;
             Ok(recognise(case.scene.into(), &case.views(), &case.query(), &truth, args.method))
         })?,
-        None => simulation(args)?,
+        None => told(simulation(args), args.json, json!({}))?,
     };
     if worked.results.is_empty() {
         worked.whole()?;
