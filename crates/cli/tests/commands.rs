@@ -72,6 +72,9 @@ fn a_cup_is_found_where_it_is_and_twice_alike() {
 fn the_papers_method_runs_and_saves_every_picture() {
     let dir = folder("paper");
     let path = dir.to_str().unwrap();
+    // What an earlier run left goes, what is not of a run stays.
+    let (left, other) = (["7-lifted-left.png", "directional-view0-3-best.png"], "7-sins-left.png");
+    left.iter().chain([&other]).for_each(|name| std::fs::write(dir.join(name), "").unwrap());
     let output = vergence(&["find", "can", "--method", "paper", "--save", path, "--json"]);
     let report = json(&output);
     assert!(report["landmark"].is_object(), "{report}");
@@ -81,6 +84,7 @@ fn the_papers_method_runs_and_saves_every_picture() {
             vergence_imaging::codec::read(&picture).unwrap();
         }
     }
+    assert!(left.iter().all(|name| !dir.join(name).exists()) && dir.join(other).exists());
     let saved = std::fs::read(dir.join("result.json")).unwrap();
     assert_eq!(serde_json::from_slice::<Value>(&saved).unwrap(), report);
     let reader = vergence_ros::recording::Reader::open(&dir.join("recording.mcap")).unwrap();
@@ -148,6 +152,53 @@ fn a_user_edits_the_workcell() {
         assert_eq!(output.status.code(), Some(2), "{to}: {message}");
         assert!(message.contains(said) && message.contains("what to do"), "{message}");
         assert!(output.stdout.is_empty());
+    }
+}
+
+/// Devices that are not there, and output that cannot be kept: exit status 1 comes with its reason.
+#[test]
+fn what_fails_under_json_says_why() {
+    let dir = folder("failing");
+    assert_eq!(vergence(&["workcell", dir.to_str().unwrap()]).status.code(), Some(0));
+    let path = dir.join("workcell.toml");
+    let text = std::fs::read_to_string(&path).unwrap();
+    // A port that was free a moment ago: nobody listens there.
+    let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let radio = format!("[radio]\ndriver = \"hci\"\ntcp = \"127.0.0.1:{port}\"");
+    let wired = text.replacen("[radio]\ndriver = \"sim\"", &radio, 1);
+    assert_ne!(wired, text);
+    std::fs::write(&path, wired).unwrap();
+    let config = ["--config", path.to_str().unwrap()];
+    let out = dir.join("calibrated.toml");
+    let below = path.join("below");
+    let save = ["--save", below.to_str().unwrap()];
+    let calibrate = ["calibrate", "--out", out.to_str().unwrap()];
+    for (command, more, said) in [
+        (&["find", "cup"][..], &config, "refused"),
+        (&["grasp", "cup"], &config, "refused"),
+        (&["tags"], &config, "refused"),
+        (&["tag", "info", "cup"], &config, "refused"),
+        (&calibrate, &config, "refused"),
+        (&["find", "cup"], &save, "below"),
+        (&["grasp", "cup"], &save, "below"),
+        (&["experiment", "1", "--seeds", "1"], &save, "below"),
+        (&["experiment", "2", "--seeds", "1"], &save, "below"),
+    ] {
+        let output = vergence(&[command, more, &["--json"]].concat());
+        let errors = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(1), "{command:?}: {errors}");
+        let told = json(&output);
+        let reason = told["reason"].as_str().unwrap();
+        assert!(reason.contains(said) && errors.contains(reason), "{command:?}: {told} {errors}");
+        assert!(told["hint"].as_str().is_some_and(|hint| !hint.is_empty()), "{told}");
+        match command[0] {
+            "find" => {
+                assert_eq!((&told["found"], &told["object_id"]), (&false.into(), &"cup".into()))
+            }
+            "grasp" => assert_eq!(told["grasp"]["succeeded"], false),
+            "calibrate" => assert_eq!(told["calibrated"], false),
+            _ => {}
+        }
     }
 }
 

@@ -131,6 +131,10 @@ fn every_tag_of_every_image_is_a_case() {
     add(&scene, 10, &scenes[1], &[3]);
     add(&scene, 2, &scenes[0], &[1, 5]);
     let (out, pictures) = (set.join("results.csv"), set.join("pictures"));
+    std::fs::create_dir_all(&pictures).unwrap();
+    for name in ["000099-view0-3-best.png", "000007-000001-0-view0-3-best.png", "mine-view0.png"] {
+        std::fs::write(pictures.join(name), "").unwrap();
+    }
     let [path, out_path, save] = [&set, &out, &pictures].map(|path| path.to_str().unwrap());
     let output = vergence(&["pose", path, "--out", out_path, "--save", save]);
     assert_eq!(output.status.code(), Some(0), "{}", text(&output.stderr));
@@ -139,6 +143,10 @@ fn every_tag_of_every_image_is_a_case() {
     for name in ["000007", "000007-000002-1", "000007-000010-0"] {
         assert!(pictures.join(format!("{name}-view1-3-best.png")).exists(), "{name}");
     }
+    // Those of an earlier run are gone, what is not of a run stays.
+    let kept = std::fs::read_dir(&pictures).unwrap().count();
+    assert_eq!(kept, 3 * 2 * 5 + 1);
+    assert!(pictures.join("mine-view0.png").exists());
     // BOP: one time for all that was found in an image.
     let table = std::fs::read_to_string(&out).unwrap();
     let times: Vec<&str> = table.lines().skip(1).filter_map(|row| row.rsplit(',').next()).collect();

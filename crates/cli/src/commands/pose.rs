@@ -12,7 +12,7 @@ use vergence_imaging::codec;
 use vergence_pose::{ObjectPose, Query, Refusal, View, directional, paper};
 
 use crate::failure::Failure;
-use crate::save::{cannot_write, unwritten};
+use crate::save::{fresh, unwritten};
 use set::{Case, Purpose};
 
 /// Recognise objects of known size in a set of pictures (BOP multi-sensor layout).
@@ -100,6 +100,17 @@ fn recognise(case: &Case, method: Method, pictures: Option<&Pictures>) -> Outcom
     Outcome { scene, image, object, result, base_from_left, seconds }
 }
 
+/// Whether `--save` writes a file of this name: `<scene>[-<image>-<position>]-view...png`.
+fn is_ours(name: &str) -> bool {
+    let Some((case, _)) = name.strip_suffix(".png").and_then(|stem| stem.split_once("-view"))
+    else {
+        return false;
+    };
+    let is_number = |part: &str| part.bytes().all(|b| b.is_ascii_digit());
+    let numbers: Vec<&str> = case.split('-').collect();
+    matches!(numbers.len(), 1 | 3) && numbers[0].len() >= 6 && numbers.into_iter().all(is_number)
+}
+
 /// Pictures of what was seen, in a folder.
 struct Pictures {
     folder: PathBuf,
@@ -109,7 +120,7 @@ struct Pictures {
 
 impl Pictures {
     fn create(folder: &Path) -> Result<Self, Failure> {
-        std::fs::create_dir_all(folder).map_err(|error| cannot_write(folder, error))?;
+        fresh(folder, is_ours)?;
         Ok(Pictures { folder: folder.into(), failed: OnceLock::new() })
     }
 

@@ -12,6 +12,9 @@
 //! recording.mcap                  images, camera info, joints, tf and the result for ROS 2 tools
 //! result.json                     what --json prints
 //! ```
+//!
+//! A grasp adds `7-{pregrasp,closed,lifted}-{left,right}.png`, and in simulation `stages.png` and
+//! `replay.json`.
 
 mod landmark;
 mod pose;
@@ -30,6 +33,19 @@ use crate::failure::Failure;
 use crate::robot::Opened;
 use landmark::{SCALE, on_canvas};
 use recorder::Recorder;
+
+/// Pictures that each side has.
+const STEPS: [&str; 9] = [
+    "1-difference",
+    "2-spectrum",
+    "3-centred",
+    "4-edges",
+    "5-field",
+    "6-template",
+    "7-pregrasp",
+    "7-closed",
+    "7-lifted",
+];
 
 /// Most frames that are kept of one watch, for the explanation of the landmark's finding.
 const MOST_FRAMES: usize = 400;
@@ -51,7 +67,7 @@ pub struct Saver {
 impl Saver {
     /// Makes the folder and opens the recording in it.
     pub fn create(dir: &Path, robot: &Opened, method: Method) -> Result<Self, Failure> {
-        std::fs::create_dir_all(dir).map_err(|error| cannot_write(dir, error))?;
+        fresh(dir, is_ours)?;
         let recorder = Recorder::create(&dir.join("recording.mcap"), robot)?;
         Ok(Saver {
             dir: dir.into(),
@@ -169,6 +185,36 @@ fn centred(frame: &Frame, seen: &[Point2<f64>]) -> Canvas {
     }
     canvas.text(4, 4, 1, "cross: image centre; circle: the light", colour::WHITE);
     canvas
+}
+
+/// A folder for the files of one run: made, and rid of those that an earlier run left, by their names, so that
+/// pictures of two runs never lie side by side.
+pub fn fresh(dir: &Path, ours: impl Fn(&str) -> bool) -> Result<(), Failure> {
+    let clear = || {
+        std::fs::create_dir_all(dir)?;
+        let mut left = Vec::new();
+        for entry in std::fs::read_dir(dir)? {
+            let entry = entry?;
+            let named = entry.file_name().to_str().is_some_and(&ours);
+            if named && !entry.file_type()?.is_dir() {
+                left.push(entry.path());
+            }
+        }
+        left.into_iter().try_for_each(std::fs::remove_file)
+    };
+    clear().map_err(|error: std::io::Error| cannot_write(dir, error))
+}
+
+/// Whether a find or a grasp writes a file of this name.
+pub fn is_ours(name: &str) -> bool {
+    let Some(stem) = name.strip_suffix(".png") else {
+        return ["recording.mcap", "result.json", "replay.json"].contains(&name);
+    };
+    let of_side = Side::BOTH.iter().find_map(|side| {
+        let step = stem.strip_suffix(side.name())?.strip_suffix('-')?;
+        Some(STEPS.contains(&step))
+    });
+    of_side.unwrap_or(stem == "stages" || stem.starts_with("directional-view"))
 }
 
 /// What is said of a picture that could not be written; the error names it.

@@ -1,6 +1,6 @@
 //! Pictures of how a tag was found: where the evidence is, how it grew, and the light itself.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use vergence_imaging::canvas::{Canvas, colour};
 use vergence_imaging::{Frame, Image, codec};
@@ -9,6 +9,7 @@ use vergence_landmark::sequential::explain::{Explanation, Moment, explain};
 use vergence_landmark::{Decision, Request};
 
 use crate::failure::Failure;
+use crate::save::{fresh, unwritten};
 
 /// Magnification of the evidence map.
 const SCALE: usize = 2;
@@ -19,6 +20,12 @@ const CAPTION: usize = 14;
 /// Longest stretch of the light that is drawn (frames).
 const SHOWN: usize = 90;
 
+const EVIDENCE: &str = "evidence";
+const DECISION: &str = "decision";
+const LIGHT: &str = "light";
+/// The pictures of a tag.
+const KINDS: [&str; 3] = [EVIDENCE, DECISION, LIGHT];
+
 /// Writes three pictures for every tag that is seen: `<tag>-evidence.png`, `<tag>-decision.png` and
 /// `<tag>-light.png`.
 pub fn save(
@@ -27,10 +34,13 @@ pub fn save(
     requests: &[Request],
     decisions: &[Decision],
 ) -> Result<(), Failure> {
-    let unwritten = |e: String| {
-        Failure::failed(format!("{}: {e}", dir.display()), "name a folder that can be written")
-    };
-    std::fs::create_dir_all(dir).map_err(|e| unwritten(e.to_string()))?;
+    // Names of tags can be anything: only all three together are surely an earlier run's.
+    fresh(dir, |name| {
+        let parts = name.strip_suffix(".png").and_then(|stem| stem.rsplit_once('-'));
+        parts.is_some_and(|(tag, kind)| {
+            KINDS.contains(&kind) && KINDS.iter().all(|kind| picture(dir, tag, kind).exists())
+        })
+    })?;
     let config = Config::default();
     for (k, (request, decision)) in requests.iter().zip(decisions).enumerate() {
         let Some(sighting) = decision.brightest() else { continue };
@@ -39,17 +49,20 @@ pub fn save(
         let name: String =
             request.id.chars().map(|c| if c.is_alphanumeric() { c } else { '-' }).collect();
         let write = |kind: &str, canvas: &Canvas| {
-            let path = dir.join(format!("{name}-{kind}.png"));
-            codec::write_canvas(&path, canvas).map_err(|e| unwritten(e.to_string()))
+            codec::write_canvas(&picture(dir, &name, kind), canvas).map_err(unwritten)
         };
         let place = (sighting.pixel.x, sighting.pixel.y);
         let Some(first) = frames.first() else { continue };
-        write("evidence", &evidence(&first.image, &found, place))?;
+        write(EVIDENCE, &evidence(&first.image, &found, place))?;
         let decided = sighting.decided_at.saturating_sub(first.stamp).as_secs_f64();
-        write("decision", &decision_plot(&found, decided))?;
-        write("light", &light(&found))?;
+        write(DECISION, &decision_plot(&found, decided))?;
+        write(LIGHT, &light(&found))?;
     }
     Ok(())
+}
+
+fn picture(dir: &Path, tag: &str, kind: &str) -> PathBuf {
+    dir.join(format!("{tag}-{kind}.png"))
 }
 
 /// The picture beside the log likelihood ratio at every pixel: grey up to the threshold, orange above.

@@ -4,18 +4,21 @@
 //! The robot says whether it holds the cup; the physics says whether that is so. Refusals come before
 //! anything moves and are counted apart.
 
+use std::path::{Path, PathBuf};
+
 use rayon::prelude::*;
 use serde::Serialize;
+use serde_json::json;
 use vergence::{FindConfig, GraspConfig, Report};
 use vergence_sim::Scenario;
 
 use super::{Experiment, quantile};
 use crate::commands::find::MethodArg;
 use crate::failure::Failure;
-use crate::output::outln;
+use crate::output::{outln, told};
 use crate::progress::Progress;
 use crate::robot::{Errors, Opened};
-use crate::save::Saver;
+use crate::save::{Saver, fresh, is_ours};
 
 /// What is grasped.
 const OBJECT: &str = "cup";
@@ -64,6 +67,9 @@ pub fn run(args: &Experiment) -> Result<bool, Failure> {
         ));
     }
     let progress = Progress::runs(args.seeds as usize);
+    if let Some(dir) = &args.save {
+        told(clear(dir), args.json, json!({ "experiment": args.number }))?;
+    }
     let runs = (1..=args.seeds)
         .into_par_iter()
         .map(|seed| {
@@ -71,8 +77,9 @@ pub fn run(args: &Experiment) -> Result<bool, Failure> {
             progress.advance(OBJECT);
             run
         })
-        .collect::<Result<Vec<_>, Failure>>()?;
+        .collect::<Result<Vec<_>, Failure>>();
     drop(progress);
+    let runs = told(runs, args.json, json!({ "experiment": args.number }))?;
     let output = statistics(args, runs);
     match args.json {
         true => crate::output::json(&output)?,
@@ -82,12 +89,32 @@ pub fn run(args: &Experiment) -> Result<bool, Failure> {
     Ok(bad == 0 && output.lifted + output.refused == output.runs.len() && output.lifted > 0)
 }
 
+/// Rids the folder of the seeds of an earlier run, which may have had more of them.
+fn clear(dir: &Path) -> Result<(), Failure> {
+    for entry in std::fs::read_dir(dir).into_iter().flatten().flatten() {
+        let path = entry.path();
+        let name = entry.file_name();
+        let seed = name.to_str().and_then(|name| name.parse::<u64>().ok());
+        if path.is_dir() && seed.is_some_and(|seed| folder(dir, seed) == path) {
+            fresh(&path, is_ours)?;
+            // What else is in it stays.
+            let _ = std::fs::remove_dir(&path);
+        }
+    }
+    Ok(())
+}
+
+/// Where the files of one seed are.
+fn folder(dir: &Path, seed: u64) -> PathBuf {
+    dir.join(format!("{seed:03}"))
+}
+
 fn grasp(args: &Experiment, seed: u64) -> Result<Run, Failure> {
     let mut robot = Opened::embedded(seed, Scenario::Reach)?;
     robot.attach_arm(OBJECT, args.save.is_some())?;
     let find = FindConfig { seed, ..FindConfig::default() };
     let config = GraspConfig { find, ..GraspConfig::default() };
-    let dir = args.save.as_ref().map(|dir| dir.join(format!("{seed:03}")));
+    let dir = args.save.as_ref().map(|dir| folder(dir, seed));
     let mut saver =
         dir.as_ref().map(|dir| Saver::create(dir, &robot, config.find.method)).transpose()?;
     let truth = robot.truth(OBJECT);
