@@ -50,6 +50,13 @@ pub fn owner_key(path: &Path) -> Result<OwnerKey, Failure> {
 /// Makes a pair of keys: the private one in `path`, which nobody else may read, the public one beside
 /// it with the ending `.pub`. Neither file may be there before.
 pub fn make_key(path: &Path) -> Result<PathBuf, Failure> {
+    let public_path = path.with_extension("pub");
+    if public_path == path {
+        return Err(Failure::misuse(
+            format!("{} would be both the private key and the public one", path.display()),
+            "name the private key FILE.pem; FILE.pub goes beside it",
+        ));
+    }
     let unusable = |path: &Path, error: std::io::Error| {
         let hint = "name files that are not there yet, in a folder that can be written";
         Failure::failed(format!("{}: {error}", path.display()), hint)
@@ -61,7 +68,6 @@ pub fn make_key(path: &Path) -> Result<PathBuf, Failure> {
     let weird = |error| Failure::failed(error, "try once more");
     let [private, public] =
         OwnerKey::from_random(&random).and_then(|key| key.to_pem()).map_err(weird)?;
-    let public_path = path.with_extension("pub");
     for (path, text, mode) in [(path, private, 0o600), (&public_path, public, 0o644)] {
         let file = File::options().write(true).create_new(true).mode(mode).open(path);
         file.and_then(|mut file| file.write_all(text.as_bytes()))

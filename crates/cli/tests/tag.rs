@@ -60,6 +60,12 @@ fn simulated_tags_answer() {
     assert!(achieved(&["tag", "info", address]).contains("simulated tag"));
     achieved(&["tag", "blink", "cup", "--pattern", "10110", "--chip-ms", "33", "--seconds", "2"]);
     refused(&["tag", "blink", "cup", "--chip-ms", "0.1"], 2);
+    for seconds in ["0", "-1", "nan", "65536"] {
+        let said = refused(&["tag", "blink", "cup", &format!("--seconds={seconds}")], 2);
+        assert!(said.contains("--seconds"), "{said}");
+    }
+    // A simulated tag ends a play after 30 s by itself.
+    assert!(refused(&["tag", "blink", "cup", "--seconds", "40"], 1).contains("went dark"));
     assert!(refused(&["tag", "info", "teapot"], 1).contains("cup"));
     assert!(achieved(&["tag", "pair", "cup"]).contains("not kept"));
 }
@@ -124,6 +130,9 @@ fn a_tag_behind_a_controller_is_paired_once_and_written_later() {
 
     // The owner signs; who trusts his key is told so, who trusts another's as well.
     let (key, other) = (dir.join("owner.pem"), dir.join("other.pem"));
+    let public = dir.join("third.pub");
+    assert!(refused(&["tag", "key", public.to_str().unwrap()], 2).contains("third.pub"));
+    assert!(!public.exists());
     for key in [&key, &other] {
         achieved(&["tag", "key", key.to_str().unwrap()]);
     }

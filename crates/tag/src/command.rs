@@ -17,6 +17,9 @@ pub const MAX_COMMAND_BYTES: usize = 20;
 /// Bytes of a state.
 pub const STATE_BYTES: usize = 2;
 
+/// Longest play that a command can ask for: its limit has 16 bits of whole seconds.
+pub const LONGEST_LIMIT: Duration = Duration::from_secs(u16::MAX as u64);
+
 /// A command to the LED.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Command {
@@ -47,7 +50,7 @@ pub enum CommandError {
 }
 
 impl Command {
-    /// The command's bytes. A limit is rounded up to whole seconds, 18 hours at most.
+    /// The command's bytes. A limit is rounded up to whole seconds, [`LONGEST_LIMIT`] at most.
     pub fn encode(&self) -> heapless::Vec<u8, MAX_COMMAND_BYTES> {
         let mut bytes = heapless::Vec::new();
         let Command::Play { pattern, limit } = self else {
@@ -56,7 +59,7 @@ impl Command {
         };
         let limit = limit.map_or(0, |limit| {
             let up = limit.as_secs() + u64::from(limit.subsec_nanos() > 0);
-            up.clamp(1, u64::from(u16::MAX)) as u16
+            up.clamp(1, LONGEST_LIMIT.as_secs()) as u16
         });
         // `Pattern::new` keeps chips below ten seconds; microseconds of more would be cut off here.
         let chip = u32::try_from(pattern.chip.as_micros()).unwrap_or(u32::MAX);

@@ -7,6 +7,7 @@ use clap::{Args, Subcommand};
 use serde::Serialize;
 use serde_json::json;
 use vergence_devices::{DeviceError, TagAddress};
+use vergence_tag::command::LONGEST_LIMIT;
 use vergence_tag::{Pattern, Record, Shown, cbor, pattern::Bits};
 
 use crate::failure::Failure;
@@ -66,7 +67,7 @@ struct Blink {
     /// How long a chip lasts (ms).
     #[arg(long, default_value_t = 100.0)]
     chip_ms: f64,
-    /// How long the light plays (s).
+    /// How long the light plays (s); a tag may be set to end it earlier.
     #[arg(long, default_value_t = 5.0)]
     seconds: f64,
     #[command(flatten)]
@@ -117,6 +118,8 @@ struct InfoOutput {
 
 /// How long the radio listens: idle tags advertise about once a second.
 const WINDOW: Duration = Duration::from_millis(2500);
+/// How long before a play's end the tag is asked whether it still plays.
+const LAST_LOOK: Duration = Duration::from_millis(500);
 /// Longest wait for one answer.
 const TIMEOUT: Duration = Duration::from_secs(5);
 
@@ -160,6 +163,13 @@ fn blink(args: &Blink) -> Result<bool, Failure> {
     };
     let chip = time(args.chip_ms, 1e-3, "--chip-ms")?;
     let limit = time(args.seconds, 1.0, "--seconds")?;
+    if limit.is_zero() || limit > LONGEST_LIMIT {
+        let most = LONGEST_LIMIT.as_secs();
+        return Err(Failure::misuse(
+            format!("--seconds {} is no time that a tag can be told", args.seconds),
+            format!("give more than 0 and at most {most}"),
+        ));
+    }
     let pattern = Pattern::new(args.pattern, chip)
         .map_err(|error| Failure::misuse(error, "choose another --chip-ms"))?;
     let mut radio = args.robot.open_radio()?;
@@ -167,9 +177,20 @@ fn blink(args: &Blink) -> Result<bool, Failure> {
     radio.link.play_for(tag, pattern, limit, TIMEOUT).map_err(failed)?;
     eprintln!("{tag} plays {} for {:.1} s", args.pattern, limit.as_secs_f64());
     // The tag goes dark when its robot is gone, so that the robot must stay.
-    radio.clock.sleep(limit);
+    let before_end = LAST_LOOK.min(limit / 2);
+    radio.clock.sleep(limit - before_end);
+    let plays = radio.link.info(tag, TIMEOUT).map_err(failed)?.playing;
+    if plays {
+        radio.clock.sleep(before_end);
+    }
     radio.link.release(tag).map_err(failed)?;
-    Ok(true)
+    match plays {
+        true => Ok(true),
+        false => Err(Failure::failed(
+            format!("{tag} went dark before {:.1} s had passed", limit.as_secs_f64()),
+            "the tag's own longest play is shorter: ask for fewer --seconds",
+        )),
+    }
 }
 
 fn pair(args: &Pair) -> Result<bool, Failure> {
