@@ -9,10 +9,11 @@ use std::collections::VecDeque;
 use std::fs::File;
 use std::future::poll_fn;
 use std::io::{self, Read, Write};
-use std::net::{Shutdown, TcpListener, TcpStream};
+use std::net::{Shutdown, TcpListener, TcpStream, ToSocketAddrs};
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Poll, Waker};
+use std::time::{Duration, Instant};
 
 use bt_hci_transport::{PacketToController, PacketToHost, Transport};
 use serial2::{FlowControl, SerialPort};
@@ -21,6 +22,30 @@ use crate::controller::{TransportError, parse, serialise};
 use crate::hci::kind;
 use crate::medium::Air;
 use crate::user_channel;
+
+/// Longest wait for a peer on TCP, to answer or to take a packet: both ends write on the thread that runs
+/// everything else.
+const PATIENCE: Duration = Duration::from_secs(3);
+
+/// Packets are short and answered at once; a peer that takes none is not waited for.
+fn prompt(stream: &TcpStream) -> io::Result<()> {
+    stream.set_nodelay(true)?;
+    stream.set_write_timeout(Some(PATIENCE))
+}
+
+/// Writes a packet. A peer that takes it in crumbs, each in time, is not waited for either.
+fn send(writer: &mut impl Write, mut packet: &[u8]) -> io::Result<()> {
+    let start = Instant::now();
+    while !packet.is_empty() && start.elapsed() < PATIENCE {
+        match writer.write(packet) {
+            Ok(0) => return Err(io::ErrorKind::WriteZero.into()),
+            Ok(count) => packet = &packet[count..],
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+            Err(error) => return Err(error),
+        }
+    }
+    if packet.is_empty() { Ok(()) } else { Err(io::ErrorKind::TimedOut.into()) }
+}
 
 /// Reads one packet with its indicator; `None` at the end of the stream.
 fn read_packet(reader: &mut impl Read) -> io::Result<Option<Vec<u8>>> {
@@ -124,11 +149,18 @@ impl<W> Drop for StreamTransport<W> {
 }
 
 impl StreamTransport<TcpStream> {
-    /// Connects to a controller that speaks H4 over TCP.
+    /// Connects to a controller that speaks H4 over TCP. One that does not answer, or later takes no packet,
+    /// is given up after [`PATIENCE`].
     pub fn connect(address: &str) -> io::Result<Self> {
-        let stream = TcpStream::connect(address)?;
-        // Packets are short and answered at once.
-        stream.set_nodelay(true)?;
+        let mut tried = Err(io::ErrorKind::NotFound.into());
+        for address in address.to_socket_addrs()? {
+            tried = TcpStream::connect_timeout(&address, PATIENCE);
+            if tried.is_ok() {
+                break;
+            }
+        }
+        let stream = tried?;
+        prompt(&stream)?;
         let socket = Some(stream.try_clone()?);
         let mut transport = StreamTransport::new(stream.try_clone()?, stream);
         transport.socket = socket;
@@ -192,7 +224,7 @@ impl<W: Write> Transport for StreamTransport<W> {
 
     async fn write<P: PacketToController>(&self, packet: &P) -> Result<(), TransportError> {
         let bytes = serialise(packet);
-        self.writer.borrow_mut().write_all(&bytes).map_err(|_| TransportError::CLOSED)
+        send(&mut *self.writer.borrow_mut(), &bytes).map_err(|_| TransportError::CLOSED)
     }
 }
 
@@ -227,7 +259,9 @@ pub async fn serve(air: Air, listener: TcpListener) {
 /// One foreign host on its own controller, until it hangs up.
 async fn guest(air: Air, stream: TcpStream, number: u8) {
     let Ok(reader) = stream.try_clone() else { return };
-    let _ = stream.set_nodelay(true);
+    if prompt(&stream).is_err() {
+        return;
+    }
     let mut writer = stream;
     let controller = air.controller([0x00, 0x56, 0x45, 0x52, 0x47, number]);
     let incoming = packets(reader);
@@ -240,7 +274,7 @@ async fn guest(air: Air, stream: TcpStream, number: u8) {
         });
         match next.await {
             Ok(packet) => {
-                if writer.write_all(&packet).is_err() {
+                if send(&mut writer, &packet).is_err() {
                     break;
                 }
             }
@@ -254,6 +288,33 @@ async fn guest(air: Air, stream: TcpStream, number: u8) {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_peer_that_does_not_answer_is_given_up() {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let address = listener.local_addr().unwrap();
+        let silent = StreamTransport::connect(&address.to_string()).unwrap();
+        // More than all buffers on the way hold.
+        let given_up = (0..1 << 17).any(|_| {
+            let start = Instant::now();
+            let sent = send(&mut *silent.writer.borrow_mut(), &[0; 1000]);
+            let waited = start.elapsed();
+            assert!(waited < 3 * PATIENCE, "{waited:?}");
+            sent.is_err()
+        });
+        assert!(given_up);
+
+        // When nobody accepts, the system at last leaves further callers without an answer.
+        let brief = Duration::from_millis(200);
+        let mut callers = Vec::new();
+        while let Ok(caller) = TcpStream::connect_timeout(&address, brief) {
+            callers.push(caller);
+        }
+        let start = Instant::now();
+        assert!(StreamTransport::connect(&address.to_string()).is_err());
+        let waited = start.elapsed();
+        assert!(waited < 2 * PATIENCE, "{waited:?} after {} callers", callers.len());
+    }
 
     #[test]
     fn packets_are_cut_where_they_end() {
