@@ -26,7 +26,7 @@ use vergence_physics::{PhysicsArm, SharedWorld, Touch, TrueObject};
 use vergence_sim::{ArmPart, Workcell};
 
 use crate::failure::Failure;
-use crate::save::cannot_write;
+use crate::save::{cannot_write, unwritten};
 
 /// Contact before the fingers close above which the arm has run into something (N).
 const BUMP: f64 = 0.5;
@@ -85,7 +85,7 @@ impl Bench {
         std::fs::write(&path, replay).map_err(|error| cannot_write(&path, error))?;
         let Some(strip) = self.strip() else { return Ok(()) };
         let path = dir.join("stages.png");
-        codec::write_canvas(&path, &strip).map_err(|error| cannot_write(&path, error))
+        codec::write_canvas(&path, &strip).map_err(unwritten)
     }
 
     /// The stages so far as an onlooker sees them, from left to right; `None` when none was taken.

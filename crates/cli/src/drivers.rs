@@ -15,6 +15,7 @@ use vergence_devices::{
     Camera, Clock, Config, Description, DeviceError, Head, PanTilt, Robot, Side,
 };
 use vergence_imaging::Frame;
+use vergence_ros::recording::RecordingError;
 use vergence_ros::{RecordingCamera, ReplayClock};
 
 use crate::failure::Failure;
@@ -176,13 +177,13 @@ impl Playback {
         config: &CameraConfig,
         folder: &Path,
         clock: SystemClock,
-    ) -> Option<Result<Self, String>> {
+    ) -> Option<Result<Self, RecordingError>> {
         let settings = config.recording.as_ref()?;
         let exposure = Duration::try_from_secs_f64(settings.exposure).unwrap_or_default();
         let file = folder.join(&settings.file);
         let opened =
             RecordingCamera::open(&file, &settings.topic, exposure, &ReplayClock::default());
-        Some(opened.map_err(|error| format!("{}: {error}", file.display())).map(|camera| {
+        Some(opened.map(|camera| {
             let start = clock.now();
             Playback { camera, clock, start, first: None, waiting: None }
         }))

@@ -35,6 +35,12 @@ pub fn told<T>(
     result
 }
 
+/// The number as people read it with so many decimals: what rounds to zero is zero and not minus zero.
+pub fn rounded(value: f64, decimals: i32) -> f64 {
+    let scale = 10f64.powi(decimals);
+    (value * scale).round() / scale + 0.0
+}
+
 /// `print!` for a reader who may have left.
 macro_rules! out {
     ($($text:tt)*) => { $crate::output::write(format_args!($($text)*)) };

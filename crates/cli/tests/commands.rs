@@ -236,6 +236,28 @@ fn a_reader_may_leave_and_a_full_disk_is_told() {
     assert!(said.contains("cannot write to standard output"), "{said}");
 }
 
+/// The table of docs/head.md, in which what is nothing has no sign.
+#[test]
+fn the_error_of_the_paper_s_equation_is_as_documented() {
+    let output = vergence(&["evaluate", "equation"]);
+    let table = String::from_utf8_lossy(&output.stdout).into_owned();
+    let printed: Vec<&str> = table.lines().skip(1).flat_map(percentages).collect();
+    let docs = include_str!("../../../docs/head.md");
+    let documented: Vec<&str> = docs
+        .lines()
+        .filter(|l| l.starts_with("| ") && l.contains("°"))
+        .flat_map(percentages)
+        .collect();
+    assert!(printed.len() == 60 && printed.contains(&"0.00"), "{table}");
+    assert_eq!(printed, documented);
+}
+
+/// The numbers of a line that stand before a per cent sign.
+fn percentages(line: &str) -> Vec<&str> {
+    let words: Vec<&str> = line.split_whitespace().collect();
+    words.windows(2).filter(|pair| pair[1] == "%").map(|pair| pair[0]).collect()
+}
+
 #[test]
 fn misuse_is_two() {
     let missing = vergence(&["find", "cup", "--config", "no/such/file.toml"]);

@@ -14,7 +14,7 @@ use vergence_head::evaluation::{
 use vergence_head::ReaimConfig;
 
 use crate::failure::Failure;
-use crate::output::outln;
+use crate::output::{outln, rounded};
 
 /// What to evaluate.
 #[derive(ClapArgs)]
@@ -101,7 +101,11 @@ fn run_equation(json: bool) {
         return;
     }
     outln!("distance [m]  slope  bearing   error, ideal head   with lever arms");
-    let percent = |e: Option<f64>| e.map_or("none".into(), |e| format!("{:+.2} %", 100.0 * e));
+    let percent = |e: Option<f64>| match e.map(|e| rounded(100.0 * e, 2)) {
+        None => "none".into(),
+        Some(0.0) => "0.00 %".into(),
+        Some(e) => format!("{e:+.2} %"),
+    };
     for e in errors {
         outln!(
             "{:>12.1}{:>7.0}{:>9.0}{:>20}{:>18}",

@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use vergence::{FindConfig, Method, Report};
 
 use crate::failure::Failure;
-use crate::output::{outln, told};
+use crate::output::{outln, rounded, told};
 use crate::progress::Progress;
 use crate::robot::{Errors, RobotArgs};
 use crate::save::Saver;
@@ -88,7 +88,7 @@ fn print(args: &Find, report: &Report) -> Result<(), Failure> {
         outln!("  what to do: {}", report.hint.unwrap_or_default());
     }
     if let Some(landmark) = &report.landmark {
-        let [x, y, z] = landmark.position;
+        let [x, y, z] = landmark.position.map(|v| rounded(v, 4));
         let sigma = [0, 4, 8].map(|k| 1e3 * landmark.covariance[k].sqrt());
         outln!(
             "landmark  x {x:.4}  y {y:.4}  z {z:.4} m  (+- {:.1}, {:.1}, {:.1} mm)",
@@ -98,7 +98,8 @@ fn print(args: &Find, report: &Report) -> Result<(), Failure> {
         );
     }
     if let Some(pose) = &report.pose {
-        let ([x, y, z], [qx, qy, qz, qw]) = (pose.position, pose.orientation);
+        let [x, y, z] = pose.position.map(|v| rounded(v, 4));
+        let [qx, qy, qz, qw] = pose.orientation.map(|v| rounded(v, 4));
         outln!("position  x {x:.4}  y {y:.4}  z {z:.4} m in base");
         outln!("rotation  x {qx:.4}  y {qy:.4}  z {qz:.4}  w {qw:.4}");
         outln!("confidence {:.3}", report.confidence.unwrap_or_default());

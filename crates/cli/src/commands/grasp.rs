@@ -8,7 +8,7 @@ use vergence::{FindConfig, GraspConfig, Report};
 
 use super::find::unfound;
 use crate::failure::Failure;
-use crate::output::{outln, told};
+use crate::output::{outln, rounded, told};
 use crate::progress::Progress;
 use crate::robot::{Opened, RobotArgs};
 use crate::save::Saver;
@@ -90,7 +90,7 @@ fn print(report: &Report) {
         outln!("the second look moved it by {shift:.1} mm");
     }
     if let Some(physics) = &grasp.physics {
-        outln!("the simulator says: it rose by {:.0} mm", physics.risen_mm);
+        outln!("the simulator says: it rose by {:.0} mm", rounded(physics.risen_mm, 0));
         if let Some(collision) = &physics.collision {
             outln!("the simulator says: {collision}");
         }

@@ -15,7 +15,7 @@ use vergence_sim::Scenario;
 use super::{Experiment, quantile};
 use crate::commands::find::MethodArg;
 use crate::failure::Failure;
-use crate::output::{outln, told};
+use crate::output::{outln, rounded, told};
 use crate::progress::Progress;
 use crate::robot::{Errors, Opened};
 use crate::save::{Saver, fresh, is_ours};
@@ -189,7 +189,7 @@ fn statistics(args: &Experiment, runs: Vec<Run>) -> Output {
 }
 
 fn print(args: &Experiment, output: &Output) {
-    let number = |value: Option<f64>| value.map_or("-".into(), |v| format!("{v:.1}"));
+    let number = |value: Option<f64>| value.map_or("-".into(), |v| format!("{:.1}", rounded(v, 1)));
     for run in &output.runs {
         let grasp = run.report.grasp.as_ref();
         let said = if run.grasped() { "grasped" } else { "not grasped" };
