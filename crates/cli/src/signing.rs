@@ -68,10 +68,15 @@ pub fn make_key(path: &Path) -> Result<PathBuf, Failure> {
     let weird = |error| Failure::failed(error, "try once more");
     let [private, public] =
         OwnerKey::from_random(&random).and_then(|key| key.to_pem()).map_err(weird)?;
-    for (path, text, mode) in [(path, private, 0o600), (&public_path, public, 0o644)] {
+    let create = |path: &Path, mode| {
         let file = File::options().write(true).create_new(true).mode(mode).open(path);
-        file.and_then(|mut file| file.write_all(text.as_bytes()))
-            .map_err(|error| unusable(path, error))?;
-    }
+        file.map_err(|error| unusable(path, error))
+    };
+    let mut private_file = create(path, 0o600)?;
+    // A private key without its public one is of no use.
+    let mut public_file =
+        create(&public_path, 0o644).inspect_err(|_| drop(fs::remove_file(path)))?;
+    private_file.write_all(private.as_bytes()).map_err(|error| unusable(path, error))?;
+    public_file.write_all(public.as_bytes()).map_err(|error| unusable(&public_path, error))?;
     Ok(public_path)
 }

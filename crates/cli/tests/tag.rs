@@ -133,6 +133,11 @@ fn a_tag_behind_a_controller_is_paired_once_and_written_later() {
     let public = dir.join("third.pub");
     assert!(refused(&["tag", "key", public.to_str().unwrap()], 2).contains("third.pub"));
     assert!(!public.exists());
+    std::fs::write(&public, "another's").unwrap();
+    let private = dir.join("third.pem");
+    assert!(refused(&["tag", "key", private.to_str().unwrap()], 1).contains("third.pub"));
+    assert!(!private.exists());
+    assert_eq!(std::fs::read_to_string(&public).unwrap(), "another's");
     for key in [&key, &other] {
         achieved(&["tag", "key", key.to_str().unwrap()]);
     }

@@ -99,7 +99,9 @@ impl Saver {
     }
 
     fn write(&mut self, name: &str, canvas: &Canvas) {
-        let path = self.dir.join(format!("{name}.png"));
+        let name = format!("{name}.png");
+        debug_assert!(is_ours(&name), "{name} would stay when the next run comes");
+        let path = self.dir.join(name);
         let written = codec::write_canvas(&path, canvas).map_err(unwritten);
         self.keep(written);
     }

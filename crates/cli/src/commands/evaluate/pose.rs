@@ -75,9 +75,10 @@ pub fn run(args: &Pose) -> Result<bool, Failure> {
         Some(set) => set::each(set, args.threads, Purpose::Comparison, |case| {
             let truth = case.truth()?;
             Ok(recognise(case.scene.into(), &case.views(), &case.query(), &truth, args.method))
-        })?,
-        None => told(simulation(args), args.json, json!({}))?,
+        }),
+        None => simulation(args),
     };
+    let worked = told(worked, args.json, json!({}))?;
     if worked.results.is_empty() {
         worked.whole()?;
     }
