@@ -64,7 +64,7 @@ pub struct Args {
     /// Write pictures of how each tag was found to this folder
     #[arg(long, conflicts_with_all = ["episodes", "bound"])]
     save: Option<PathBuf>,
-    /// Write the JSON and the wall time to this file (with --episodes: one file an episode in this folder)
+    /// Write the JSON to this file (with --episodes: one file an episode in this folder)
     #[arg(long)]
     out: Option<PathBuf>,
 }
@@ -137,7 +137,7 @@ fn run_set(set: &Path, out: &Path, method: Method) -> Result<bool, Failure> {
 }
 
 fn write(path: &Path, report: &Report) -> Result<(), Failure> {
-    std::fs::write(path, report.timed()).map_err(|e| {
+    std::fs::write(path, report.json()).map_err(|e| {
         Failure::failed(format!("{}: {e}", path.display()), "name a file that can be written")
     })
 }

@@ -19,17 +19,7 @@ pub struct Report {
     undecided: Vec<String>,
     /// Frames of the recording.
     frames: usize,
-    /// Wall time of reading and looking (s). It differs from run to run, so that it is no part of what is
-    /// printed.
-    #[serde(skip)]
-    seconds: f64,
-}
-
-/// What a file for scorers holds.
-#[derive(Serialize)]
-struct Timed<'a> {
-    #[serde(flatten)]
-    report: &'a Report,
+    /// Wall time of reading and looking (s).
     seconds: f64,
 }
 
@@ -110,10 +100,9 @@ impl Report {
         !self.detections.is_empty() || !self.absent.is_empty()
     }
 
-    /// One JSON document with the wall time.
-    pub fn timed(&self) -> String {
-        let timed = Timed { report: self, seconds: self.seconds };
-        serde_json::to_string_pretty(&timed).unwrap_or_default()
+    /// One JSON document.
+    pub fn json(&self) -> String {
+        serde_json::to_string_pretty(self).unwrap_or_default()
     }
 
     /// One line for a table of episodes.
