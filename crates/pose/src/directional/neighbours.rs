@@ -19,7 +19,7 @@ use super::search::Search;
 use super::sites::Site;
 use super::verdict::Explained;
 
-/// How far the contour is moved (px of the working scale, which is at most two of the picture's).
+/// How far the contour is moved (px of the working scale, counted as two of the picture's at most).
 const HOP_PX: f64 = 2.5;
 /// How the edges around are looked at before: range to either side (hops) and spacing of sites (px).
 const AROUND: (f64, f64) = (1.8, 4.0);
