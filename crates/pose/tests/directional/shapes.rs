@@ -3,6 +3,7 @@
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
 use nalgebra::{Point3, UnitQuaternion, Vector3};
+use rand::{RngExt, SeedableRng};
 use serde_json::json;
 use vergence_geometry::{Symmetry, Transform};
 use vergence_pose::directional::{self, Config};
@@ -157,4 +158,74 @@ fn of_two_balls_that_touch_at_the_landmark_both_are_considered() {
         let near = |pose: &Transform| (pose.translation.vector - ball.coords).norm() < 0.006;
         assert!(others.chain([found.pose.pose]).any(|pose| near(&pose)), "{ball}: {found:?}");
     }
+}
+
+#[test]
+fn every_record_that_is_valid_is_answered_or_refused() {
+    let mut rng = rand_pcg::Pcg32::seed_from_u64(17);
+    let piece = Piece::cuboid([-0.04, -0.03, -0.03], [0.05, 0.04, 0.05]);
+    let any = record([0.1; 3], json!({"kind": "box"}), [0.0, 0.0, 0.05], [0.0, 0.0, 1.0]);
+    let mut scene = Scene::new(&any, &[piece], UnitQuaternion::identity(), 1);
+    let mut judged = 0;
+    for seed in 0..20 {
+        let mut size = |low: f64, high: f64| rng.random_range(low..high);
+        let corners = size(4.0, 48.0) as usize;
+        let shape = match seed % 4 {
+            // Any hull, the corners of a lattice among them: many lie in one plane or within a face.
+            0 => {
+                let steps = size(1.5, 6.0).floor();
+                let mut at = || (steps * size(-1.0, 1.0)).round() / steps * 0.05;
+                json!({"kind": "convex", "vertices": (0..corners).map(|_| [at(), at(), at()]).collect::<Vec<_>>()})
+            }
+            // Any star, some of its points nearly in its middle.
+            1 => {
+                let corners = corners.clamp(3, 24);
+                let point = |k: usize| {
+                    let (angle, r) = (TAU * k as f64 / corners as f64, size(1e-4, 0.05));
+                    [r * angle.cos(), r * angle.sin()]
+                };
+                let outline: Vec<[f64; 2]> = (0..corners).map(point).collect();
+                json!({"kind": "prism", "outline": outline, "height": 0.1})
+            }
+            2 => {
+                let (top, bottom) = (size(1e-4, 0.1), size(1e-4, 0.1));
+                json!({"kind": "cup", "top_diameter": top, "bottom_diameter": bottom, "height": 0.1})
+            }
+            _ => {
+                json!({"kind": "cylinder", "diameter": size(1e-4, 0.1), "height": size(1e-4, 0.1)})
+            }
+        };
+        // As wide as the shape says: the origin is the box's middle.
+        let widest =
+            |values: Vec<f64>| 2.0 * values.into_iter().fold(0.0, |a: f64, v| a.max(v.abs()));
+        let number = |key: &str| shape[key].as_f64().unwrap_or(0.0);
+        let along = |key: &str, axis: usize| {
+            let points = shape[key].as_array().into_iter().flatten();
+            widest(points.map(|p| p[axis].as_f64().unwrap()).collect())
+        };
+        let sides = match shape["kind"].as_str().unwrap() {
+            "convex" => [0, 1, 2].map(|axis| along("vertices", axis)),
+            "prism" => [along("outline", 0), along("outline", 1), 0.1],
+            "cup" => {
+                let wide = number("top_diameter").max(number("bottom_diameter"));
+                [wide, wide, 0.1]
+            }
+            _ => [number("diameter"), number("diameter"), number("height")],
+        };
+        let landmark = [0.0, 0.0, 0.5 * sides[2]];
+        let record = record(sides, shape, landmark, [0.0, 0.0, 1.0]);
+        if record.validate().is_err() {
+            continue;
+        }
+        judged += 1;
+        // The same pictures of a box for all: what they show does not matter.
+        scene.landmark.position = scene.truth * Point3::from(landmark);
+        for up in [true, false] {
+            if let Ok(found) = recognise(&scene, &record, up) {
+                assert!((0.0..=1.0).contains(&found.confidence), "{found:?}");
+                assert!(found.pose.covariance.cholesky().is_some(), "{found:?}");
+            }
+        }
+    }
+    assert!(judged > 14, "only {judged} records were valid");
 }
