@@ -149,12 +149,9 @@ impl Camera {
         // Derivative of r (1 + k1 r^2 + k2 r^4 + k3 r^6) by r, and where it is the least over r^2.
         let grows = |s: f64| 1.0 + s * (3.0 * d.k1 + s * (5.0 * d.k2 + s * 7.0 * d.k3)) > 0.0;
         let (a, b, c) = (21.0 * d.k3, 10.0 * d.k2, 3.0 * d.k1);
-        let root = (b * b - 4.0 * a * c).sqrt();
-        let turns = match a == 0.0 {
-            true => [-c / b, f64::NAN],
-            false => [(-b + root) / (2.0 * a), (-b - root) / (2.0 * a)],
-        };
-        // What is not a number is no such place.
+        // Both roots without a difference of nearly equal numbers. What is not a number is no such place.
+        let q = -0.5 * (b + (b * b - 4.0 * a * c).sqrt().copysign(b));
+        let turns = [q / a, c / q];
         grows(r2) && turns.into_iter().all(|s| !(s > 0.0 && s < r2) || grows(s))
     }
 
@@ -266,6 +263,7 @@ mod tests {
             (-0.3, 0.0, 0.0, true),
             (-0.6, 0.1, 0.0, true),
             (-0.3, 0.1, -0.02, true),
+            (-0.6, 0.1, 1e-18, true),
             (-0.28, 0.07, 0.0, false),
             (0.1, 0.0, 5.0, false),
         ] {

@@ -368,14 +368,18 @@ impl Search<'_> {
     fn twins(&self, of: &Refined) -> Vec<(Refined, Explained)> {
         let stands = |p: &Transform| {
             let up = self.query.up.map_or(0.0, |up| (p.rotation * Vector3::z()).dot(&up));
-            self.query.standing != Some(true) || up > 0.0
+            self.query.standing != Some(true) || up > 0.9
         };
-        self.query
-            .near_symmetries(self.model)
+        // Cut corners and rounded numbers make several motions of what is one.
+        let mut twins = vec![of.pose];
+        for pose in self.query.near_symmetries(self.model).iter().map(|s| of.pose * s) {
+            if stands(&pose) && twins.iter().all(|twin| !self.is_same(&pose, twin)) {
+                twins.push(pose);
+            }
+        }
+        twins
             .into_iter()
-            .map(|s| of.pose * s)
-            .filter(|p| !self.is_same(p, &of.pose))
-            .filter(stands)
+            .skip(1)
             .map(|pose| {
                 let mut twin = Refined { pose, ..of.without_sites() };
                 self.refine(&mut twin, &FINE);

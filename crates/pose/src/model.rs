@@ -173,10 +173,10 @@ impl Model {
         }
     }
 
-    /// Directions (object frame, unit) in which flat faces are, on which the object can stand.
+    /// Directions (object frame, unit) in which flat faces are, on which the object may stand.
     pub fn resting_directions(&self) -> Vec<Vector3<f64>> {
         match self {
-            Model::Polyhedron(body) => body.face_normals(),
+            Model::Polyhedron(body) => body.face_normals().collect(),
             Model::Frustum(_) => vec![-Vector3::z(), Vector3::z()],
             Model::Sphere(_) => vec![-Vector3::z()],
         }
@@ -185,20 +185,22 @@ impl Model {
     /// How the object rests that has this direction (object frame, unit) below: on the face, the line
     /// of its wall or the point that is nearest.
     pub fn rest(&self, below: &Vector3<f64>) -> Rest {
-        let anyhow = Rest { down: *below, held: Matrix3::zeros() };
-        let rests = match self {
+        let near = |a: &Vector3<f64>, b: &Vector3<f64>| a.dot(below).total_cmp(&b.dot(below));
+        match self {
             // Any point of a ball is as good, and nothing keeps it from rolling.
-            Model::Sphere(_) => return anyhow,
-            Model::Polyhedron(body) => body.face_normals().into_iter().map(Rest::on).collect(),
-            Model::Frustum(body) => {
-                let down = body.wall(below);
-                let axis = down.cross(&Vector3::z()).normalize();
-                let lying = Rest { down, held: axis * axis.transpose() };
-                vec![Rest::on(-Vector3::z()), Rest::on(Vector3::z()), lying]
+            Model::Sphere(_) => Rest { down: *below, held: Matrix3::zeros() },
+            Model::Polyhedron(body) => {
+                Rest::on(body.face_normals().max_by(near).unwrap_or(-Vector3::z()))
             }
-        };
-        let near = |rest: &Rest| rest.down.dot(below);
-        rests.into_iter().max_by(|a, b| near(a).total_cmp(&near(b))).unwrap_or(anyhow)
+            Model::Frustum(body) => {
+                let (wall, end) = (body.wall(below), Vector3::z() * 1f64.copysign(below.z));
+                if near(&wall, &end).is_lt() {
+                    return Rest::on(end);
+                }
+                let axis = wall.cross(&Vector3::z()).normalize();
+                Rest { down: wall, held: axis * axis.transpose() }
+            }
+        }
     }
 }
 

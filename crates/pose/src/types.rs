@@ -20,7 +20,7 @@ pub struct View<'a> {
     /// Standard deviation of a small turn of the camera about its own x and y axes (rad): how well
     /// the head's angles are known. Zero when exactly. When it is not zero, the landmark is taken
     /// to have been triangulated from these views (and others, when it is better known than they
-    /// could tell), so that a part of its error is theirs.
+    /// could tell), so that a part of its error is theirs; with one view it is its own.
     pub turn_sd: f64,
 }
 
@@ -50,6 +50,8 @@ pub struct Query<'a> {
 /// Motions that move the landmark by less than this (m) cannot be told apart by anybody: it is
 /// four standard deviations of a good triangulation.
 const SYMMETRY_SLACK: f64 = 0.004;
+/// A body of 48 corners comes home after so many turns of one kind.
+const MOST_POWERS: usize = 48;
 /// A body counts as symmetric when its corners come this near (m) to where others were.
 const CORNER_TOLERANCE: f64 = 0.0004;
 
@@ -62,9 +64,19 @@ impl Query<'_> {
 
     /// The motions of the object that neither its form nor its landmark can tell apart.
     pub fn symmetry(&self) -> Symmetry {
+        self.symmetry_of(&Model::new(self.record))
+    }
+
+    /// [`Query::symmetry`] with the record's model.
+    pub(crate) fn symmetry_of(&self, model: &Model) -> Symmetry {
         let Some((landmark, _)) = self.landmark_in_object() else { return Symmetry::none() };
-        let keep = |s: &Transform| {
+        let stays = |s: &Transform| {
             (s.transform_point(&landmark.into()).coords - landmark).norm() < SYMMETRY_SLACK
+        };
+        // With all its powers: what is kept is to be a group.
+        let keep = |s: &Transform| {
+            let powers = std::iter::successors(Some(*s), |p| Some(p * s));
+            powers.take(MOST_POWERS).take_while(|p| p.rotation.angle() > 0.01).all(|p| stays(&p))
         };
         match &self.record.shape {
             Shape::Cylinder { .. } => {
@@ -73,7 +85,7 @@ impl Query<'_> {
             Shape::Cup { .. } => Symmetry::Revolution { flip: false },
             Shape::Sphere { .. } => Symmetry::Full,
             Shape::Box | Shape::Prism { .. } | Shape::Convex { .. } => {
-                let motions = Model::new(self.record).symmetries(CORNER_TOLERANCE);
+                let motions = model.symmetries(CORNER_TOLERANCE);
                 Symmetry::Finite(motions.into_iter().filter(keep).collect())
             }
         }
@@ -125,7 +137,7 @@ pub struct ObjectPose {
     pub coverage: f64,
     /// Other poses, best first.
     pub alternatives: Vec<Alternative>,
-    /// Turns about which the result says nothing.
+    /// Motions about which the result says nothing.
     pub symmetry: Symmetry,
 }
 

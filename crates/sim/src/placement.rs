@@ -2,8 +2,9 @@
 //!
 //! Promises: nothing interpenetrates; every tagged object stands on the table (in the scenario "fallen"
 //! on any of its sides), its landmark faces the heads and is in line of sight of both; at the heads'
-//! rest it is outside both pictures; in the scenario "occluded" something hides a part of the cup but not its landmark; in the scenario "reach"
-//! the first object called cup stands where the arm reaches it.
+//! rest it is outside both pictures; in the scenario "occluded" something hides a part of the cup but
+//! not its landmark; in the scenario "reach" the first object called cup stands where the arm reaches
+//! it.
 
 use std::ops::Range;
 

@@ -125,7 +125,8 @@ fn random_object(scenario: Scenario, rng: &mut Pcg64Mcg) -> ObjectSettings {
     let surface = surfaces[rng.random_range(0..surfaces.len())];
     // Rounded to the millimetre, as a record would be written.
     let mut size = |low: f64, high: f64| (1e3 * rng.random_range(low..high)).round() / 1e3;
-    let kind = size(0.0, if scenario == Scenario::Fallen { 4.0 } else { 3.0 }) as u32;
+    let kinds = if scenario == Scenario::Fallen { 4 } else { 3 };
+    let kind = (size(0.0, f64::from(kinds)) as u32).min(kinds - 1);
     let height = size(0.05, 0.14);
     let (shape, sides, normal) = match kind {
         0 => (Shape::Box, [size(0.05, 0.14), size(0.04, 0.1), height], Vector3::x()),

@@ -279,8 +279,10 @@ impl Record {
     }
 }
 
-/// Corners nearer than this (m) are one, and what is no thicker is flat.
-const THIN: f64 = 1e-6;
+/// Corners nearer than this (m) are one.
+const NEAR: f64 = 1e-6;
+/// What is no thicker than this (m) is flat.
+const THIN: f64 = 1e-4;
 
 /// Whether no edge of a polygon is a point and no two meet but neighbours at their corner.
 fn is_simple(outline: &[[f64; 2]]) -> bool {
@@ -294,7 +296,7 @@ fn is_simple(outline: &[[f64; 2]]) -> bool {
     let between = |a: [f64; 2], b: [f64; 2], c: [f64; 2]| {
         (0..2).all(|k| c[k] >= a[k].min(b[k]) && c[k] <= a[k].max(b[k]))
     };
-    let long = |i: usize| (0..2).any(|k| (corner(i)[k] - corner(i + 1)[k]).abs() > THIN);
+    let long = |i: usize| (0..2).any(|k| (corner(i)[k] - corner(i + 1)[k]).abs() > NEAR);
     let meet = |i: usize, j: usize| {
         let (a, b, c, d) = (corner(i), corner(i + 1), corner(j), corner(j + 1));
         let of_first = [turn(a, b, c), turn(a, b, d)];

@@ -34,7 +34,7 @@ impl Landmark {
         let place = Matrix3::identity() * (PLACE_SD * PLACE_SD);
         let mut by_turn = [Matrix3x2::zeros(); VIEWS];
         let mut covariance = landmark.covariance;
-        let turning = sights.len() > 1 && sights.iter().all(|s| s.view.turn_sd > 0.0);
+        let turning = sights.len() > 1 && sights.iter().any(|s| s.view.turn_sd > 0.0);
         if let Some(moves) = turning.then(|| triangulation(sights, query)).flatten() {
             let variance = |sight: &Sight| sight.view.turn_sd.powi(2);
             let explained = moves.iter().zip(sights).map(|(m, s)| m * m.transpose() * variance(s));

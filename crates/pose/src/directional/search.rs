@@ -103,7 +103,7 @@ impl<'a> Search<'a> {
         (landmark, normal): (Vector3<f64>, Vector3<f64>),
         config: &'a Config,
     ) -> Self {
-        let (measured, symmetry) = (Landmark::new(sights, query), query.symmetry());
+        let (measured, symmetry) = (Landmark::new(sights, query), query.symmetry_of(model));
         Search { sights, model, query, measured, symmetry, landmark, normal, config }
     }
 }
@@ -143,14 +143,16 @@ impl Search<'_> {
             }
         }
         found.sort_by(|a, b| b.evidence.total_cmp(&a.evidence));
-        let least = found.first().map_or(0.0, |best| self.config.worth_a_climb * best.evidence);
+        let share = self.config.worth_a_climb;
+        let least = found.first().map_or(0.0, |best| best.evidence.min(share * best.evidence));
         found.retain(|h| h.evidence >= least);
         let mut seeds = self.distinct(&found, self.config.seeds, self.config.grid_spacing);
         for seed in &mut seeds {
             self.climb(seed, about, &mut scratch);
         }
         seeds.sort_by(|a, b| b.evidence.total_cmp(&a.evidence));
-        let least = seeds.first().map_or(0.0, |best| self.config.worth * best.evidence);
+        let share = self.config.worth;
+        let least = seeds.first().map_or(0.0, |best| best.evidence.min(share * best.evidence));
         seeds.retain(|h| h.evidence >= least);
         let mut best = self.distinct(&seeds, count, 0.5 * self.config.grid_spacing);
         for hypothesis in &mut best {

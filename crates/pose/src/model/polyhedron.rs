@@ -31,8 +31,13 @@ struct Edge {
     faces: [usize; 2],
 }
 
-/// Points closer than this (m) count as one; faces closer in direction than this as one plane.
+/// Points closer than this (m) count as one, and a point this near to a plane lies on it.
 const WELD: f64 = 1e-6;
+/// Faces that bend by less than this (rad) show no edge: a record's corners are rounded, and a face of
+/// more than three of them comes as several that are nearly in one plane.
+const BEND: f64 = 0.03;
+/// Faces that are looked at: of a prism there are at most 26, of a hull of 48 corners 92.
+const MOST_FACES: usize = 128;
 /// A concave body's edges are cut into so many pieces to see which are hidden, and into so many in the
 /// search.
 const FINE_PIECES: usize = 12;
@@ -59,8 +64,8 @@ impl Polyhedron {
         Self::from_loops(vertices, loops, (0..n).all(|i| turn(i) >= 0.0))
     }
 
-    /// The convex hull of a few points, by trying every plane through three of them: cubic in
-    /// their number, which a record bounds by 48. Points that are no corner of it do not matter.
+    /// The convex hull of a few points, by trying every plane through three of them, of which a record
+    /// has at most 48. Points that are no corner of it do not matter.
     pub fn hull(points: &[Vector3<f64>]) -> Self {
         let mut corners: Vec<Vector3<f64>> = Vec::new();
         for p in points {
@@ -78,8 +83,9 @@ impl Polyhedron {
                     for n in [n, -n] {
                         let offset = n.dot(a);
                         let outside = |p: &Vector3<f64>| n.dot(p) > offset + WELD;
+                        // Three points of a plane that is there already make no other.
                         let known = |(m, o): &(Vector3<f64>, f64)| {
-                            (m - n).norm() < 1e-4 && (o - offset).abs() < 10.0 * WELD
+                            m.dot(&n) > 0.0 && [a, b, c].iter().all(|p| lies_on(m, *o, p))
                         };
                         if !corners.iter().any(outside) && !planes.iter().any(known) {
                             planes.push((n, offset));
@@ -89,10 +95,10 @@ impl Polyhedron {
             }
         }
         let loops = planes.iter().map(|(n, offset)| {
-            let on = |&i: &usize| (n.dot(&corners[i]) - offset).abs() < 10.0 * WELD;
+            let on = |&i: &usize| lies_on(n, *offset, &corners[i]);
             around(&corners, n, (0..corners.len()).filter(on))
         });
-        let loops = loops.collect();
+        let loops = loops.filter(|l| l.len() > 2).take(MOST_FACES).collect();
         Self::from_loops(corners, loops, true)
     }
 
@@ -122,20 +128,21 @@ impl Polyhedron {
         }
         // Between two faces of one plane, as at a corner within an edge of a prism's outline, there is
         // nothing to see.
-        let bends = |e: &Edge| (faces[e.faces[0]].normal - faces[e.faces[1]].normal).norm() > WELD;
+        let bends = |e: &Edge| (faces[e.faces[0]].normal - faces[e.faces[1]].normal).norm() > BEND;
         edges.retain(bends);
         Polyhedron { vertices, faces, edges, convex }
     }
 
     /// Outward normals of the faces.
-    pub fn face_normals(&self) -> Vec<Vector3<f64>> {
-        self.faces.iter().map(|f| f.normal).collect()
+    pub fn face_normals(&self) -> impl Iterator<Item = Vector3<f64>> {
+        self.faces.iter().map(|f| f.normal)
     }
 
     /// The motions of the object frame that put every edge onto an edge, to within a tolerance (m);
     /// the identity first.
     pub fn symmetries(&self, tolerance: f64) -> Vec<Transform> {
-        let corner = |i: usize| self.vertices[i] - self.middle();
+        let middle = self.middle();
+        let corner = |i: usize| self.vertices[i] - middle;
         let used: Vec<usize> = (0..self.vertices.len())
             .filter(|i| self.edges.iter().any(|e| e.ends.contains(i)))
             .collect();
@@ -157,7 +164,7 @@ impl Polyhedron {
                 let Some(there) = frame(corner(i), corner(j)) else { continue };
                 let turn = Rotation3::from_matrix_unchecked(there * here.transpose());
                 let turn = UnitQuaternion::from_rotation_matrix(&turn);
-                let shift = self.middle() - turn * self.middle();
+                let shift = middle - turn * middle;
                 let motion = Transform::from_parts(shift.into(), turn);
                 let new = found.iter().all(|f| f.rotation.angle_to(&turn) > 0.01);
                 if new && self.is_kept(&motion, tolerance) {
@@ -187,9 +194,10 @@ impl Polyhedron {
 
     /// Writes the visible contour; `fine` cuts the edges of a concave body into more pieces.
     pub(super) fn outline(&self, eye: &Vector3<f64>, fine: bool, out: &mut Outline) {
-        // A bit a face; records have at most 26 faces of prisms, hulls at most 92.
+        // A bit a face.
+        const { assert!(MOST_FACES <= u128::BITS as usize) };
         let mut seen = 0u128;
-        for (k, face) in self.faces.iter().enumerate().take(128) {
+        for (k, face) in self.faces.iter().enumerate() {
             seen |= u128::from(face.normal.dot(eye) > face.offset) << k;
         }
         out.points.extend_from_slice(&self.vertices);
@@ -276,6 +284,11 @@ impl Polyhedron {
     }
 }
 
+/// Whether a point lies on a plane, to the accuracy with which planes through three points are known.
+fn lies_on(normal: &Vector3<f64>, offset: f64, point: &Vector3<f64>) -> bool {
+    (normal.dot(point) - offset).abs() < 10.0 * WELD
+}
+
 /// The corners of a convex face among points of its plane, counter-clockwise from outside: Andrew's
 /// monotone chain. What lies within the face or on one of its edges is left out.
 fn around(
@@ -360,6 +373,32 @@ mod tests {
         for kind in [Kind::Silhouette, Kind::Crease] {
             assert!((lengths(&body, eye, kind) - lengths(&square, eye, kind)).abs() < 1e-12);
         }
+    }
+
+    #[test]
+    fn corners_that_are_rounded_are_those_of_the_same_body() {
+        // Six trapezoids, whose corners to a tenth of a millimetre are in no plane.
+        let rounded = |v: f64| (v * 1e4).round() / 1e4;
+        let corner = |k: usize, radius: f64, z: f64| {
+            let angle = std::f64::consts::TAU * k as f64 / 6.0;
+            Vector3::new(rounded(radius * angle.cos()), rounded(radius * angle.sin()), z)
+        };
+        let ends = (0..6).flat_map(|k| [corner(k, 0.05, -0.04), corner(k, 0.0365, 0.04)]);
+        let body = Polyhedron::hull(&ends.collect::<Vec<_>>());
+        assert_eq!(body.edges.len(), 18);
+        assert_eq!(body.symmetries(4e-4).len(), 6);
+    }
+
+    #[test]
+    fn a_thin_plate_of_many_corners_has_no_more_faces_than_it_can() {
+        let corner = |k: usize| {
+            let (angle, r) = (2.4 * k as f64, 0.002 + 0.0001 * (k % 7) as f64);
+            let z = 5e-5 * if k.is_multiple_of(2) { 1.0 } else { -1.0 };
+            Vector3::new(r * angle.cos(), r * angle.sin(), z + 2e-6 * (k % 5) as f64)
+        };
+        let body = Polyhedron::hull(&(0..48).map(corner).collect::<Vec<_>>());
+        assert!(body.faces.len() <= 92, "{} faces", body.faces.len());
+        assert!(body.face_normals().all(|n| (n.norm() - 1.0).abs() < 1e-9));
     }
 
     #[test]

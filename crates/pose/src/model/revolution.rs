@@ -163,7 +163,9 @@ pub(super) fn sphere_outline(radius: f64, eye: &Vector3<f64>, chords: usize, out
     let axis = eye / distance;
     let height = radius * radius / distance;
     let r = (radius * radius - height * height).sqrt();
-    let other = if axis.x.abs() < 0.7 { Vector3::x() } else { Vector3::y() };
+    // Eyes that see a ball together look the same way, and seldom along x: the arcs have the same
+    // numbers for both.
+    let other = if axis.x.abs() < 0.95 { Vector3::x() } else { Vector3::y() };
     let u = axis.cross(&other).normalize();
     let v = axis.cross(&u);
     let at = |k: usize| {
