@@ -138,11 +138,12 @@ fn what_turned_the_cameras_also_moved_the_landmark() {
     squares.sort_by(f64::total_cmp);
     errors.sort_by(f64::total_cmp);
     assert!(answered >= 12, "only {answered} of 14 answered");
-    assert!(held + 1 >= answered, "the 95 % ellipsoid holds {held} of {answered}");
+    assert!(held == answered, "the 95 % ellipsoid holds {held} of {answered}");
     let median = squares[squares.len() / 2];
     assert!((0.1..2.5).contains(&median), "{median} per degree of freedom in the median");
-    let median = errors[errors.len() / 2];
-    assert!(median < 7.0, "off by {median:.1} mm in the median");
+    // An angle of 4 mrad is 4 mm at this distance, and more in depth.
+    let (median, worst) = (errors[errors.len() / 2], errors[errors.len() - 1]);
+    assert!(median < 7.0 && worst < 20.0, "off by {median:.1} mm, {worst:.1} mm at worst");
 }
 
 #[test]
