@@ -70,6 +70,11 @@ pub fn independent(site: &Site) -> f64 {
     (site.length / (CORRELATION_PX + CORRELATION * site.px_per_metre)).min(1.0)
 }
 
+/// Precision (1/rad^2) with which a step holds the turns. What nothing is known of, as of a ball's turn
+/// about its landmark, would else be turned by radians for the slightest reason, and a turn as large takes
+/// those along that are known.
+const HOLD: f64 = 10.0;
+
 /// One pass of the refinement.
 #[derive(Debug, Clone, Copy)]
 pub struct Pass {
@@ -140,7 +145,7 @@ impl Search<'_> {
         sd_px: f64,
         moved: &mut Move,
     ) {
-        if let Some(found) = self.solve(refined, sites, sd_px, moved, 1.0) {
+        if let Some(found) = self.solve(refined, sites, sd_px, moved, (1.0, HOLD)) {
             moved.shared += found.step.shared;
             moved.own.iter_mut().zip(found.step.own).for_each(|(m, s)| *m += s);
             refined.offsets = found.offsets;
@@ -152,7 +157,7 @@ impl Search<'_> {
         self.lay_out(refined, &pass.layout);
         let sites = std::mem::take(&mut refined.sites);
         let still = Move::default();
-        let solution = self.solve(refined, &by_part(&sites), pass.sd_px, &still, DOUBT);
+        let solution = self.solve(refined, &by_part(&sites), pass.sd_px, &still, (DOUBT, 0.0));
         if let Some(solution) = solution {
             refined.covariance = solution.covariance();
         }
@@ -172,14 +177,15 @@ impl Search<'_> {
         refined.sites = found;
     }
 
-    /// One Gauss-Newton step from `moved` on sites in the order of [`by_part`].
+    /// One Gauss-Newton step from `moved` on sites in the order of [`by_part`]; turns are held with some
+    /// precision (1/rad^2).
     fn solve(
         &self,
         refined: &Refined,
         sites: &[&Site],
         sd_px: f64,
         moved: &Move,
-        doubt: f64,
+        (doubt, hold): (f64, f64),
     ) -> Option<Solution> {
         let mut equations = Equations::new(self.sights.len(), sd_px, doubt);
         let mut edges = Vec::new();
@@ -201,7 +207,8 @@ impl Search<'_> {
         }
         let mut now = refined.without_sites();
         now.apply(moved);
-        let (a, b) = self.prior(&now);
+        let (mut a, b) = self.prior(&now);
+        (0..3).for_each(|k| a[(k, k)] += hold);
         equations.shared(&a, &b);
         let (residual, by_shared) = self.landmark_residual(&now);
         equations.landmark(&residual, &by_shared, &self.measured);
@@ -244,7 +251,7 @@ impl Search<'_> {
             a[(FORM_AT + k, FORM_AT + k)] += sd.powi(-2);
             b[FORM_AT + k] -= off * sd.powi(-2);
         }
-        // A solid of revolution says nothing about one turn: hold it.
+        // A solid of revolution says nothing about one turn: it gets a value all the same.
         a += SharedMatrix::identity() * 1e-3;
         (a, b)
     }
