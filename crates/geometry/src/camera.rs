@@ -146,6 +146,11 @@ impl Camera {
     pub fn is_one_to_one(&self, x: f64, y: f64) -> bool {
         let d = &self.distortion;
         let r2 = x * x + y * y;
+        // Mostly its terms together are too small to turn it, which costs little to see.
+        let terms = r2 * (3.0 * d.k1.abs() + r2 * (5.0 * d.k2.abs() + r2 * 7.0 * d.k3.abs()));
+        if terms < 1.0 {
+            return true;
+        }
         // Derivative of r (1 + k1 r^2 + k2 r^4 + k3 r^6) by r, and where it is the least over r^2.
         let grows = |s: f64| 1.0 + s * (3.0 * d.k1 + s * (5.0 * d.k2 + s * 7.0 * d.k3)) > 0.0;
         let (a, b, c) = (21.0 * d.k3, 10.0 * d.k2, 3.0 * d.k1);

@@ -1,9 +1,9 @@
 //! Stereo pictures of one tagged object with its truth, for measuring pose recognition in bulk.
 //!
-//! In: a seed. Out: two pictures of a random box, can or cup (fallen: or ball) among clutter, taken by heads that
-//! have turned to its landmark; the record, the landmark as a triangulation would report it, and the
-//! true pose. The light is dark in the pictures. Cameras are exact: what the head does not know is
-//! in the landmark's error.
+//! In: a seed. Out: two pictures of a random box, can or cup (fallen: or ball) among clutter, taken by
+//! heads that have turned to its landmark; the record, the landmark as a triangulation would report it,
+//! and the true pose. The light is dark in the pictures. Cameras are exact: what the head does not know
+//! is in the landmark's error.
 
 use std::sync::Arc;
 
