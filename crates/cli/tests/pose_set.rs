@@ -276,3 +276,27 @@ fn a_set_is_compared_with_its_truth() {
     }
     assert_eq!(evaluate(&["--seed", "3"]).status.code(), Some(2));
 }
+
+#[test]
+fn scenes_that_were_drawn_and_written_are_answered_alike_when_read() {
+    let set = folder("pose-set-saved");
+    let set = set.to_str().unwrap();
+    let evaluate = |args: &[&str]| vergence(&[&["evaluate", "pose", "--json"], args].concat());
+    let figures = |args: &[&str]| -> Value {
+        let output = evaluate(args);
+        assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+        serde_json::from_slice(&output.stdout).unwrap()
+    };
+    let drawn = figures(&["--scenes", "3", "--seed", "7", "--save", set]);
+    let read = figures(&["--set", set]);
+    assert_eq!(drawn["answered"], read["answered"]);
+    assert_eq!(drawn["refused"], read["refused"]);
+    for figure in ["median_position_mm", "median_rotation_deg", "nees_over_freedoms_median"] {
+        let [drawn, read] = [&drawn, &read].map(|f| f[figure].as_f64().unwrap());
+        assert!((drawn - read).abs() < 1e-3, "{figure}: {drawn} drawn, {read} read");
+    }
+    // What another run wrote is kept.
+    let again = evaluate(&["--scenes", "1", "--save", set]);
+    assert_eq!(again.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&again.stderr).contains("a new folder"));
+}

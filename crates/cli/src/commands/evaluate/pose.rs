@@ -36,6 +36,9 @@ pub struct Pose {
     /// Draw objects on any side that they can rest on, balls among them, instead of standing ones.
     #[arg(long, conflicts_with = "set")]
     fallen: bool,
+    /// Folder to write the scenes to that are drawn, as a pose set with its truth (docs/pose.md).
+    #[arg(long, conflicts_with = "set")]
+    save: Option<PathBuf>,
     /// How to recognise.
     #[arg(long, value_enum, default_value_t = Method::Directional)]
     method: Method,
@@ -71,6 +74,12 @@ pub fn run(args: &Pose) -> Result<bool, Failure> {
         let what = format!("--scenes {} is not between 1 and 100000", args.scenes);
         return Err(Failure::misuse(what, "give a number in that range"));
     }
+    if let Some(folder) = &args.save
+        && folder.join("test").exists()
+    {
+        let what = format!("{} holds a pose set already", folder.display());
+        return Err(Failure::misuse(what, "give --save a new folder"));
+    }
     let worked = match &args.set {
         Some(set) => set::each(set, args.threads, Purpose::Comparison, |case| {
             let truth = case.truth()?;
@@ -105,6 +114,9 @@ fn simulated(seed: u64, args: &Pose) -> Result<(Outcome, f64), Failure> {
     let scenario = if args.fallen { Scenario::Fallen } else { Scenario::Default };
     let scene =
         stereo_scene(scenario, seed).map_err(|e| Failure::failed(e, "take another --seed"))?;
+    if let Some(folder) = &args.save {
+        set::write(folder, seed, &scene)?;
+    }
     let views = [0, 1].map(|k| View {
         image: &scene.images[k],
         camera: scene.cameras[k],

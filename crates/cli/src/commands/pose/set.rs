@@ -2,25 +2,31 @@
 //!
 //! Read are `scene_camera_*.json`, `scene_tags.json` and the pictures; the truth
 //! (`scene_gt_left.json`) only where answers are compared with it. A scene may hold several images, and an
-//! image several tags: each tag in each image is a case of its own. Lengths on disk are millimetres, here
-//! metres.
+//! image several tags: each tag in each image is a case of its own. Simulated scenes are written in the same
+//! layout, for other recognisers. Lengths on disk are millimetres, here metres.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use nalgebra::{Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
 use rayon::prelude::*;
-use serde::Deserialize;
 use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
 use vergence_geometry::{Camera, Distortion, GaussianPoint, Transform};
 use vergence_imaging::{Image, codec};
 use vergence_pose::{Query, View};
+use vergence_sim::StereoScene;
 use vergence_tag::{Record, Shown};
 
 use crate::failure::Failure;
+use crate::save::{cannot_write, unwritten};
 
 const MM: f64 = 1e-3;
 const LAYOUT_HINT: &str = "docs/pose.md describes the layout of a pose set";
+/// The cameras; the right one may be missing.
+const SIDES: [&str; 2] = ["left", "right"];
+/// Number of the object of a simulated scene.
+const OBJECT: u32 = 1;
 /// Most by which a number of `cam_K` that must be zero or one may be off: rounding.
 const K_ROUNDING: f64 = 1e-9;
 
@@ -76,7 +82,7 @@ struct Picture {
     pans: bool,
 }
 
-#[derive(Deserialize)]
+#[derive(Deserialize, Serialize)]
 #[allow(non_snake_case)]
 struct CameraEntry {
     cam_K: [f64; 9],
@@ -87,12 +93,15 @@ struct CameraEntry {
     cam_dist: Option<[f64; 5]>,
     /// A camera that pans and tilts stands on a robot, whose base is level.
     pan: Option<f64>,
+    /// Written for others.
+    #[serde(skip_deserializing)]
+    tilt: Option<f64>,
     /// How well the camera's angles are known (rad); exactly when absent.
     #[serde(default)]
     turn_sd: f64,
 }
 
-#[derive(Deserialize)]
+#[derive(Deserialize, Serialize)]
 struct TagEntry {
     obj_id: u32,
     landmark_w: [f64; 3],
@@ -101,7 +110,7 @@ struct TagEntry {
     standing: Option<bool>,
 }
 
-#[derive(Deserialize)]
+#[derive(Deserialize, Serialize)]
 #[allow(non_snake_case)]
 struct TruthEntry {
     obj_id: u32,
@@ -184,9 +193,9 @@ impl Scene {
             return Err(bad(&path, "names no tag"));
         }
         let mut cameras = Vec::new();
-        for side in ["left", "right"] {
+        for side in SIDES {
             let path = camera_path(folder, side);
-            if side == "left" || path.exists() {
+            if side == SIDES[0] || path.exists() {
                 cameras.push((side, by_image(&path)?));
             }
         }
@@ -352,6 +361,61 @@ fn rigid(rotation: &[f64; 9], translation_mm: &[f64; 3]) -> Option<Transform> {
     (sound && t.iter().all(|v| v.is_finite())).then(|| Transform::from_parts(t.into(), rotation))
 }
 
+/// A pose as BOP writes it, to millimetres.
+fn rows(pose: &Transform) -> ([f64; 9], [f64; 3]) {
+    let by_rows = pose.rotation.to_rotation_matrix().matrix().transpose();
+    let translation = pose.translation.vector / MM;
+    (std::array::from_fn(|k| by_rows[k]), translation.into())
+}
+
+/// Writes a simulated scene with its truth as the scene of this number. A scene of that number that is
+/// there already is not touched.
+pub fn write(set: &Path, number: u64, scene: &StereoScene) -> Result<(), Failure> {
+    let test = set.join("test");
+    let folder = test.join(format!("{number:06}"));
+    std::fs::create_dir_all(&test).map_err(|e| cannot_write(&test, e))?;
+    std::fs::create_dir(&folder).map_err(|e| cannot_write(&folder, e))?;
+    let optical_from_base = scene.base_from_optical.map(|pose| pose.inverse());
+    for (k, side) in SIDES.into_iter().enumerate() {
+        let path = picture_path(&folder, side, 0);
+        std::fs::create_dir(folder.join(pictures(side))).map_err(|e| cannot_write(&path, e))?;
+        codec::write_png(&path, &scene.images[k]).map_err(unwritten)?;
+        let Camera { fx, fy, cx, cy, distortion: Distortion { k1, k2, p1, p2, k3 }, .. } =
+            scene.cameras[k];
+        let (rotation, translation_mm) = rows(&optical_from_base[k]);
+        let ahead = scene.base_from_optical[k].rotation * Vector3::z();
+        let camera = CameraEntry {
+            cam_K: [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
+            cam_R_w2c: rotation,
+            cam_t_w2c: translation_mm,
+            cam_dist: Some([k1, k2, p1, p2, k3]),
+            pan: Some(ahead.y.atan2(ahead.x)),
+            tilt: Some(-ahead.z.asin()),
+            turn_sd: 0.0,
+        };
+        write_image(&camera_path(&folder, side), &camera)?;
+    }
+    let (rotation, translation_mm) = rows(&(optical_from_base[0] * scene.base_from_object));
+    let truth = TruthEntry { obj_id: OBJECT, cam_R_m2c: rotation, cam_t_m2c: translation_mm };
+    write_image(&truth_path(&folder), &[truth])?;
+    let landmark = &scene.landmark;
+    let tag = TagEntry {
+        obj_id: OBJECT,
+        landmark_w: (landmark.position.coords / MM).into(),
+        landmark_cov_w: std::array::from_fn(|k| landmark.covariance[k] / (MM * MM)),
+        tag: scene.record.clone(),
+        standing: None,
+    };
+    write_image(&folder.join("scene_tags.json"), &[tag])
+}
+
+/// A JSON file of BOP about the scene's one image.
+fn write_image(path: &Path, entry: &(impl Serialize + ?Sized)) -> Result<(), Failure> {
+    let text = serde_json::to_vec_pretty(&BTreeMap::from([("0", entry)]));
+    let written = text.map_err(Into::into).and_then(|text| std::fs::write(path, text));
+    written.map_err(|error| cannot_write(path, error))
+}
+
 fn camera_path(folder: &Path, side: &str) -> PathBuf {
     folder.join(format!("scene_camera_{side}.json"))
 }
@@ -360,9 +424,14 @@ fn truth_path(folder: &Path) -> PathBuf {
     folder.join("scene_gt_left.json")
 }
 
+/// The folder of a camera's pictures in a scene's.
+fn pictures(side: &str) -> String {
+    format!("gray_{side}")
+}
+
 /// BOP names pictures by six digits; PNG is usual, JPEG is read too.
 fn picture_path(folder: &Path, side: &str, image: u32) -> PathBuf {
-    let stem = folder.join(format!("gray_{side}")).join(format!("{image:06}"));
+    let stem = folder.join(pictures(side)).join(format!("{image:06}"));
     let candidates = ["png", "jpg", "jpeg"].map(|e| stem.with_extension(e));
     candidates.iter().find(|p| p.exists()).unwrap_or(&candidates[0]).clone()
 }
