@@ -228,6 +228,28 @@ fn what_is_the_request_itself_in_shorter_chips_is_no_rival() {
 
 /// Time stamps come from outside: a clock that jumps by ages must not end the robot.
 #[test]
+fn a_light_too_bright_for_the_picture_is_found_however_it_falls_into_the_exposures() {
+    // A chip a frame, as `find` asks for: where the changes fall into the exposures they do so every time,
+    // and a light so bright is white although it shines through a small part of one.
+    let pattern = codebook::assign(0, 30.0).unwrap();
+    let request = Request { id: "a".into(), pattern, clock_tolerance: 2e-4 };
+    let missed = |amplitude: f64| {
+        let misses = |step: &u32| {
+            // Within half a millisecond to either side of what an exposure of 4 ms cuts.
+            let phase = 1e-3 * (33.333 - 4.5 + 5.0 * f64::from(*step) / 20.0);
+            let light = Light { phase, rate: 1.0, ..light(&request, 30.3, 32.8, amplitude) };
+            let scene = Scene { lights: vec![light], exposure: 0.004, ..Scene::flat(SIDE, SIDE) };
+            let finder = watch(&scene, std::slice::from_ref(&request), 36, 7);
+            place(&finder.decisions()[0]).is_none()
+        };
+        (0..20).filter(misses).count()
+    };
+    for amplitude in [60.0, 400.0, 600.0, 1500.0, 6000.0] {
+        assert_eq!(missed(amplitude), 0, "of 20 with {amplitude} grey levels");
+    }
+}
+
+#[test]
 fn a_clock_that_jumps_by_ages_does_no_harm() {
     let requests = [request("a", "1110010", 63.0), request("b", "110100100101", 40.0)];
     for jump in [1u64 << 33, 1 << 45, 1 << 53, 1 << 62] {

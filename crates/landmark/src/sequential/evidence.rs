@@ -80,16 +80,16 @@ impl Series {
         }
     }
 
-    /// The light that a pattern at a phase and rate would give here, cleared of nuisances.
+    /// The light that a pattern would give here under a hypothesis, cleared of nuisances.
     pub fn expect(
         &self,
         pattern: &Pattern,
         times: &[(f64, f64)],
-        (phase, rate): (f64, f64),
+        hypothesis: &Hypothesis,
         nuisance: &Nuisance,
         out: &mut Vec<f32>,
     ) {
-        light(pattern, times, phase, rate, out);
+        light(pattern, times, hypothesis, out);
         self.clear(nuisance, out);
     }
 
@@ -283,10 +283,11 @@ pub fn refine(
 ) -> Evidence {
     let mut expected = Vec::with_capacity(times.len());
     let mut at = |phase: f64| {
-        series.expect(pattern, times, (phase, start.best.rate), nuisance, &mut expected);
+        let at = Hypothesis { phase, ..start.best };
+        series.expect(pattern, times, &at, nuisance, &mut expected);
         let norm2 = f64::from(dot(&expected, &expected)).max(1e-9);
         let correlation = f64::from(dot(&expected, &series.values)) / norm2.sqrt();
-        let best = Hypothesis { phase, norm2, ..start.best };
+        let best = Hypothesis { norm2, ..at };
         Evidence { best, correlation, ..start }
     };
     let ratio = 0.5 * (5f64.sqrt() - 1.0);

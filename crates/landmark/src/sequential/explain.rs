@@ -162,8 +162,7 @@ impl Watcher {
         let (pattern, times) = (&request.pattern, self.history.times());
         let best = refine(&series, pattern, times, &self.nuisance, start, bank.step);
         let mut expected = Vec::new();
-        let at = (best.best.phase, best.best.rate);
-        series.expect(pattern, times, at, &self.nuisance, &mut expected);
+        series.expect(pattern, times, &best.best, &self.nuisance, &mut expected);
         let amplitude = best.amplitude();
         let sample = |((t, e), m): ((&(f64, f64), &f32), &f32)| Sample {
             time: t.0,

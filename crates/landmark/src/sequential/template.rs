@@ -10,12 +10,11 @@ use super::nuisance::{Nuisance, dot, dot_columns};
 /// Finest step of the phase in the bank, as a share of a chip or of the time between frames.
 const PHASE_STEP: f64 = 0.25;
 
-/// Share of light in every frame (0 to 1) for a pattern that is `phase` seconds into its period at
-/// time zero and whose clock runs `rate` times as fast as the camera's.
-pub fn light(pattern: &Pattern, times: &[(f64, f64)], phase: f64, rate: f64, out: &mut Vec<f32>) {
+/// Share of light in every frame (0 to 1) that a pattern gives under a hypothesis.
+pub fn light(pattern: &Pattern, times: &[(f64, f64)], h: &Hypothesis, out: &mut Vec<f32>) {
     out.clear();
-    let share = |&(t, e): &(f64, f64)| pattern.on_fraction(phase + rate * t, rate * e) as f32;
-    out.extend(times.iter().map(share));
+    let share = |&(t, e): &(f64, f64)| pattern.on_fraction(h.phase + h.rate * t, h.rate * e);
+    out.extend(times.iter().map(|time| h.shown(share(time)) as f32));
 }
 
 /// Time (s) over which clock rates are told apart at most. A window that is longer has a jump of the
@@ -63,6 +62,10 @@ impl Lit {
     }
 }
 
+/// How many times too bright for the picture a light is taken to be that is: half or a sixth of the
+/// exposure makes it white. What lies between is told by the phase.
+const EXCESSES: [f64; 2] = [2.0, 6.0];
+
 /// One phase and rate of a bank.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hypothesis {
@@ -70,8 +73,17 @@ pub struct Hypothesis {
     pub phase: f64,
     /// Tag seconds per camera second.
     pub rate: f64,
+    /// How many times too bright for the picture the light is; one is not.
+    pub excess: f64,
     /// Squared length of the expected light, nuisances taken out (frames).
     pub norm2: f64,
+}
+
+impl Hypothesis {
+    /// What a picture shows of a share of light.
+    fn shown(&self, share: f64) -> f64 {
+        (self.excess * share).min(1.0)
+    }
 }
 
 /// The expected light for all phases and rates of one pattern. It grows by a row a frame: nothing is
@@ -106,11 +118,27 @@ impl Bank {
         let stride = ((PHASE_STEP * pattern.chip.as_secs_f64() / step) as usize).max(1);
         let coarse = |k: &usize| k.is_multiple_of(stride);
         let (first, rest): (Vec<usize>, Vec<usize>) = (0..phases).partition(coarse);
-        let at = |k: usize, rate: f64| Hypothesis { phase: k as f64 * step, rate, norm2: 0.0 };
+        let at = |k: usize, rate: f64| Hypothesis {
+            phase: k as f64 * step,
+            rate,
+            excess: 1.0,
+            norm2: 0.0,
+        };
         let of = |phases: &[usize]| -> Vec<Hypothesis> {
             rates.iter().flat_map(|&rate| phases.iter().map(move |&k| at(k, rate))).collect()
         };
-        let hypotheses = [of(&first), of(&rest)].concat();
+        let mut hypotheses = [of(&first), of(&rest)].concat();
+        // A light so near that it is white as soon as it shines through a part of the exposure: where all
+        // changes fall into exposures it seems to play another pattern.
+        if is_in_step(pattern, times) {
+            let (start, exposure) = times.first().copied().unwrap_or_default();
+            let chip = pattern.chip.as_secs_f64();
+            let cut =
+                |h: &&Hypothesis| (h.phase + h.rate * start).rem_euclid(chip) + exposure > chip;
+            let white: Vec<_> = hypotheses.iter().filter(cut).copied().collect();
+            let with = |excess| white.iter().map(move |h| Hypothesis { excess, ..*h });
+            hypotheses.extend(EXCESSES.into_iter().flat_map(with));
+        }
         Bank {
             lit: Lit::new(pattern),
             templates: Vec::new(),
@@ -127,7 +155,8 @@ impl Bank {
     /// Whether the bank has so many clock rates.
     pub fn has_rates(&self, count: usize) -> bool {
         let first = self.hypotheses.first().map(|h| h.phase);
-        self.hypotheses.iter().filter(|h| Some(h.phase) == first).count() == count
+        let at_first = |h: &&Hypothesis| Some(h.phase) == first && h.excess == 1.0;
+        self.hypotheses.iter().filter(at_first).count() == count
     }
 
     /// Brings the bank up to a window whose frames have the numbers `frames` (from the first frame
@@ -164,8 +193,9 @@ impl Bank {
         for &(t, e) in &times[times.len() - (frames.end - known).min(times.len())..] {
             // An exposure of no length sees one chip.
             let span = e.max(1e-6);
-            let share = |h: &Hypothesis| self.lit.share(h.phase + h.rate * t, h.rate * span) as f32;
-            self.templates.extend(self.hypotheses.iter().map(share));
+            let share =
+                |h: &Hypothesis| h.shown(self.lit.share(h.phase + h.rate * t, h.rate * span));
+            self.templates.extend(self.hypotheses.iter().map(|h| share(h) as f32));
         }
         self.frames = frames;
     }
@@ -184,14 +214,18 @@ fn phase_step(pattern: &Pattern, times: &[(f64, f64)]) -> f64 {
     let chip = pattern.chip.as_secs_f64();
     let between = gap(times).max(1e-4);
     let step = PHASE_STEP * chip.min(between).max(0.25 * chip);
-    // Where a chip lasts a whole number of frames, every change falls at the same point of an
-    // exposure: inside it, all frames are half lit, and only a step as fine as that tells.
-    let frames = chip / between;
-    if (frames - frames.round()).abs() < 0.05 * frames {
+    // Inside an exposure all frames are half lit, and only a step as fine as that tells.
+    if is_in_step(pattern, times) {
         let exposure = times.first().map_or(0.0, |t| t.1);
         return step.min((0.25 * exposure).max(chip / 32.0));
     }
     step
+}
+
+/// Whether a chip lasts a whole number of frames: every change falls at the same point of an exposure.
+fn is_in_step(pattern: &Pattern, times: &[(f64, f64)]) -> bool {
+    let frames = pattern.chip.as_secs_f64() / gap(times).max(1e-4);
+    (frames - frames.round()).abs() < 0.05 * frames
 }
 
 /// Clock rates close enough that the pattern stays within a quarter of a chip over `span` seconds.

@@ -79,7 +79,7 @@ impl<'a> Rivals<'a> {
             noise: series.noise + MODEL * energy / series.freedom,
             light: Vec::new(),
         };
-        light(&own.pattern, times, phase, rate, &mut lit.light);
+        light(&own.pattern, times, &evidence.best, &mut lit.light);
         let span = times.last().map_or(0.0, |l| l.0) - times.first().map_or(0.0, |f| f.0);
         Rivals {
             requests: round.requests,

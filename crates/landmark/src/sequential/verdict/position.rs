@@ -35,8 +35,8 @@ impl Round<'_> {
         for _ in 0..2 {
             evidence =
                 refine(&series, pattern, self.history.times(), self.nuisance, evidence, step);
-            let best = (evidence.best.phase, evidence.best.rate);
-            series.expect(pattern, self.history.times(), best, self.nuisance, &mut expected);
+            let times = self.history.times();
+            series.expect(pattern, times, &evidence.best, self.nuisance, &mut expected);
             let moved = self.peak(place, &expected, &mut raw);
             let (dx, dy) = (moved.x - seen.place.x, moved.y - seen.place.y);
             if dx.abs().max(dy.abs()) > 2.0 {
@@ -131,8 +131,8 @@ impl Round<'_> {
         let (x, y) = (seen.place.x.round(), seen.place.y.round());
         let mut expected = Vec::new();
         let pattern = &self.requests[request].pattern;
-        let best = (seen.evidence.best.phase, seen.evidence.best.rate);
-        seen.series.expect(pattern, self.history.times(), best, self.nuisance, &mut expected);
+        let (times, best) = (self.history.times(), &seen.evidence.best);
+        seen.series.expect(pattern, times, best, self.nuisance, &mut expected);
         let length = seen.evidence.best.norm2.sqrt();
         let mut raw = Vec::new();
         let patch: [f64; spot::PIXELS] = std::array::from_fn(|k| {

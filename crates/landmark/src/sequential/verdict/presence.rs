@@ -46,8 +46,8 @@ impl Round<'_> {
     fn whiteness(&self, request: usize, seen: &Seen) -> f64 {
         let (evidence, series) = (&seen.evidence, &seen.series);
         let (pattern, times) = (&self.requests[request].pattern, self.history.times());
-        let (best, mut rest) = ((evidence.best.phase, evidence.best.rate), Vec::new());
-        series.expect(pattern, times, best, self.nuisance, &mut rest);
+        let mut rest = Vec::new();
+        series.expect(pattern, times, &evidence.best, self.nuisance, &mut rest);
         let amplitude = evidence.amplitude() as f32;
         rest.iter_mut().zip(&series.values).for_each(|(r, v)| *r = v - amplitude * *r);
         let (energy, n) = (dot(&rest, &rest).max(1e-9), rest.len());
