@@ -37,7 +37,7 @@ pub enum SimError {
         why: Invalid,
     },
     /// A shape that cannot be drawn.
-    #[error("[sim] object \"{0}\": the simulator draws box, cylinder, cup and sphere only")]
+    #[error("[sim] object \"{0}\": its vertices enclose nothing")]
     Shape(String),
     /// A record that no tag can hold.
     #[error("[sim] object \"{id}\": its record has {bytes} bytes, a tag holds {MAX_BYTES}")]

@@ -14,6 +14,7 @@ mod camera;
 mod config;
 mod devices;
 mod error;
+mod faces;
 mod lights;
 mod noise;
 mod placement;

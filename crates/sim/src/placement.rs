@@ -334,7 +334,7 @@ impl Builder {
             );
             let solid = Solid::Box(half.map(|h| h as f32));
             let surface = material(Surface::Printed, &solid, rng);
-            let body = Body::new(solid, &place, surface);
+            let body = Body::new(solid.clone(), &place, surface);
             let share = self.hidden_share(target, &body.placed);
             let partly = share.iter().all(|s| (0.15..0.5).contains(s));
             if partly && self.try_add(body, objects, |_| true) {
@@ -365,7 +365,7 @@ impl Builder {
             );
             let surface = Material::matt(0.09, Texture::Plain, 5).glossy(0.04);
             let solid = Solid::Box(half.map(|h| h as f32));
-            let body = Body::new(solid, &place, surface);
+            let body = Body::new(solid.clone(), &place, surface);
             let clear_of = |builder: &Self| builder.hides_little(objects);
             if self.try_add(body, objects, clear_of) {
                 self.clutter.push((place, solid));
@@ -400,7 +400,8 @@ impl Builder {
             );
             let kind = [Surface::Plain, Surface::Printed, Surface::Striped, Surface::Speckled]
                 [rng.random_range(0..4)];
-            let body = Body::new(solid, &place, material(kind, &solid, rng));
+            let surface = material(kind, &solid, rng);
+            let body = Body::new(solid.clone(), &place, surface);
             if self.try_add(body, objects, |builder| builder.hides_little(objects)) {
                 self.clutter.push((place, solid));
                 self.taken.push([x, y, radius]);

@@ -17,6 +17,7 @@ use vergence_tag::{BoundingBox, LandmarkSite, Record, Semantic, Shape};
 use crate::camera::{Capture, Sensor};
 use crate::config::{ObjectSettings, Scenario, SimConfig, Surface};
 use crate::error::SimError;
+use crate::faces;
 use crate::noise::{normal, stream};
 use crate::placement::{RestView, compose};
 use crate::trace::Stage;
@@ -118,44 +119,63 @@ fn triangulated(
     GaussianPoint { position: landmark + error, covariance }
 }
 
-/// A box, can or cup, or where things have fallen a ball too, of everyday size with its landmark on the
-/// side.
+/// Cross-sections of prisms in a square of side one: triangle, house, trapezium, hexagon, angle iron.
+const PROFILES: [&[[f64; 2]]; 5] = [
+    &[[-0.5, -0.5], [0.5, -0.5], [0.0, 0.5]],
+    &[[-0.5, -0.5], [0.5, -0.5], [0.5, 0.1], [0.0, 0.5], [-0.5, 0.1]],
+    &[[-0.5, -0.5], [0.5, -0.5], [0.3, 0.5], [-0.3, 0.5]],
+    &[[-0.5, 0.0], [-0.25, -0.5], [0.25, -0.5], [0.5, 0.0], [0.25, 0.5], [-0.25, 0.5]],
+    &[[-0.5, -0.5], [0.5, -0.5], [0.5, -0.1], [-0.1, -0.1], [-0.1, 0.5], [-0.5, 0.5]],
+];
+
+/// A length between two, to the millimetre, as a record would have it.
+fn length(rng: &mut Pcg64Mcg, low: f64, high: f64) -> f64 {
+    (1e3 * rng.random_range(low..high)).round() / 1e3
+}
+
+/// A box, can or cup, or where things have fallen a ball, prism or blunt pyramid too, of everyday size with
+/// its landmark on the side.
 fn random_object(scenario: Scenario, rng: &mut Pcg64Mcg) -> ObjectSettings {
     let surfaces = [Surface::Plain, Surface::Printed, Surface::Striped, Surface::Speckled];
     let surface = surfaces[rng.random_range(0..surfaces.len())];
-    // Rounded to the millimetre, as a record would be written.
-    let mut size = |low: f64, high: f64| (1e3 * rng.random_range(low..high)).round() / 1e3;
-    let kinds = if scenario == Scenario::Fallen { 4 } else { 3 };
-    let kind = (size(0.0, f64::from(kinds)) as u32).min(kinds - 1);
-    let height = size(0.05, 0.14);
-    let (shape, sides, normal) = match kind {
-        0 => (Shape::Box, [size(0.05, 0.14), size(0.04, 0.1), height], Vector3::x()),
+    let kinds = if scenario == Scenario::Fallen { 6 } else { 3 };
+    let kind = (length(rng, 0.0, f64::from(kinds)) as u32).min(kinds - 1);
+    let height = length(rng, 0.05, 0.14);
+    let (shape, sides) = match kind {
+        0 => (Shape::Box, [length(rng, 0.05, 0.14), length(rng, 0.04, 0.1), height]),
         1 => {
-            let diameter = size(0.05, 0.09);
-            (Shape::Cylinder { diameter, height }, [diameter, diameter, height], Vector3::x())
+            let diameter = length(rng, 0.05, 0.09);
+            (Shape::Cylinder { diameter, height }, [diameter, diameter, height])
+        }
+        2 => {
+            let top_diameter = length(rng, 0.06, 0.09);
+            let bottom_diameter = (1e3 * top_diameter * length(rng, 0.65, 1.0)).round() / 1e3;
+            let shape = Shape::Cup { top_diameter, bottom_diameter, height };
+            (shape, [top_diameter, top_diameter, height])
         }
         3 => {
-            let diameter = size(0.05, 0.1);
-            (Shape::Sphere { diameter }, [diameter; 3], Vector3::x())
+            let diameter = length(rng, 0.05, 0.1);
+            (Shape::Sphere { diameter }, [diameter; 3])
+        }
+        4 => {
+            let profile = PROFILES[rng.random_range(0..PROFILES.len())];
+            let [x, y] = [0, 1].map(|_| length(rng, 0.05, 0.1));
+            let outline = profile.iter().map(|c| [c[0] * x, c[1] * y]).collect();
+            (Shape::Prism { outline, height }, [x, y, height])
         }
         _ => {
-            let top_diameter = size(0.06, 0.09);
-            let bottom_diameter = (1e3 * top_diameter * size(0.65, 1.0)).round() / 1e3;
-            let slope = 0.5 * (top_diameter - bottom_diameter) / height;
-            let shape = Shape::Cup { top_diameter, bottom_diameter, height };
-            (shape, [top_diameter, top_diameter, height], Vector3::new(1.0, 0.0, -slope))
+            let bottom = [0, 1].map(|_| length(rng, 0.06, 0.12));
+            let top = bottom.map(|side| side * length(rng, 0.3, 0.9));
+            let ring = |[x, y]: [f64; 2], z: f64| {
+                [[-x, -y], [x, -y], [x, y], [-x, y]].map(|c| [0.5 * c[0], 0.5 * c[1], z])
+            };
+            let vertices = [ring(bottom, -0.5 * height), ring(top, 0.5 * height)];
+            let vertices = vertices.into_iter().flatten().collect();
+            (Shape::Convex { vertices }, [bottom[0], bottom[1], height])
         }
     };
-    let normal = normal.normalize();
-    let z = if kind == 3 { 0.0 } else { size(-0.1, 0.35) * height };
-    let radius = match shape {
-        Shape::Cup { top_diameter, bottom_diameter, .. } => {
-            0.25 * (top_diameter + bottom_diameter)
-                + 0.5 * (top_diameter - bottom_diameter) * z / height
-        }
-        _ => 0.5 * sides[0],
-    };
-    let position = Vector3::new(radius, 0.0, z) + normal * 0.001;
+    let (place, normal) = on_the_side(&shape, sides, rng);
+    let position = place + normal * 0.001;
     let site = LandmarkSite { position: position.into(), normal: normal.into() };
     let text = |name: &str| name.parse().unwrap_or_default();
     let [width, length, height] = sides;
@@ -173,6 +193,32 @@ fn random_object(scenario: Scenario, rng: &mut Pcg64Mcg) -> ObjectSettings {
         passkey: None,
         at: None,
         yaw_deg: None,
+    }
+}
+
+/// A place on an object's surface with the normal there: on a wall, or amid a face that nothing of the object
+/// hides.
+fn on_the_side(shape: &Shape, sides: [f64; 3], rng: &mut Pcg64Mcg) -> (Vector3<f64>, Vector3<f64>) {
+    if let Some(all) = faces::faces(shape) {
+        let outermost = faces::outermost(&all);
+        let shown: Vec<_> =
+            all.iter().filter(|face| outermost.iter().any(|o| o.holds(face))).collect();
+        if !shown.is_empty() {
+            let face = shown[rng.random_range(0..shown.len())];
+            return (face.middle().coords, face.normal);
+        }
+    }
+    if matches!(shape, Shape::Sphere { .. }) {
+        return (Vector3::x() * (0.5 * sides[0]), Vector3::x());
+    }
+    let z = length(rng, -0.1, 0.35) * sides[2];
+    match *shape {
+        Shape::Cup { top_diameter, bottom_diameter, height } => {
+            let slope = 0.5 * (top_diameter - bottom_diameter) / height;
+            let radius = 0.25 * (top_diameter + bottom_diameter) + slope * z;
+            (Vector3::new(radius, 0.0, z), Vector3::new(1.0, 0.0, -slope).normalize())
+        }
+        _ => (Vector3::new(0.5 * sides[0], 0.0, z), Vector3::x()),
     }
 }
 

@@ -20,6 +20,7 @@ use crate::camera::{Blinker, Capture, Sensor};
 use crate::config::{GeometryError, ObjectSettings, Scenario, SimConfig};
 use crate::devices::{SimCamera, SimClock, SimPanTilt};
 use crate::error::SimError;
+use crate::faces::hull;
 use crate::lights::Play;
 use crate::noise::{normal, stream};
 use crate::placement::{RestView, TaggedObject, compose};
@@ -307,7 +308,7 @@ pub struct ArmPart {
     pub albedo: f32,
 }
 
-/// The rendered form of a solid; a hull is shown as the box around it.
+/// The rendered form of a solid.
 fn rendered(solid: &Solid) -> trace::Solid {
     let round = |radius: f64, half: f64| trace::Solid::Frustum {
         bottom: radius as f32,
@@ -319,8 +320,7 @@ fn rendered(solid: &Solid) -> trace::Solid {
         Solid::Cylinder { radius, half_height } => round(*radius, *half_height),
         Solid::Sphere { radius } => trace::Solid::Sphere(*radius as f32),
         Solid::Convex { vertices } => {
-            let reach = |k: usize| vertices.iter().map(|v| v[k].abs()).fold(0.0, f64::max);
-            trace::Solid::Box([0, 1, 2].map(|k| reach(k) as f32))
+            trace::Solid::Faceted(Arc::new(trace::Facets::new(&hull(vertices))))
         }
     }
 }
@@ -331,12 +331,15 @@ fn solid_of(solid: &trace::Solid) -> Solid {
         radius: f64::from(radius),
         half_height: f64::from(half),
     };
-    match *solid {
+    match solid {
         trace::Solid::Box(half) => Solid::Cuboid { half: half.map(f64::from).into() },
         trace::Solid::Frustum { bottom, top, half }
-        | trace::Solid::Cup { bottom, top, half, .. } => cylinder(bottom.max(top), half),
-        trace::Solid::Sphere(radius) => Solid::Sphere { radius: f64::from(radius) },
-        trace::Solid::Capsule { half, radius } => cylinder(radius, half + radius),
+        | trace::Solid::Cup { bottom, top, half, .. } => cylinder(bottom.max(*top), *half),
+        trace::Solid::Faceted(facets) => {
+            Solid::Cuboid { half: facets.half().map(f64::from).into() }
+        }
+        trace::Solid::Sphere(radius) => Solid::Sphere { radius: f64::from(*radius) },
+        trace::Solid::Capsule { half, radius } => cylinder(*radius, half + radius),
     }
 }
 

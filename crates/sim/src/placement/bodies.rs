@@ -1,5 +1,7 @@
 //! The bodies of tagged objects and of untagged things.
 
+use std::sync::Arc;
+
 use nalgebra::{Point3, Translation3, UnitQuaternion, Vector3};
 use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
@@ -8,8 +10,9 @@ use vergence_tag::{LandmarkSite, Shape};
 
 use crate::config::{ObjectSettings, Surface};
 use crate::error::SimError;
+use crate::faces::faces;
 use crate::scene::{Body, Material};
-use crate::trace::{Solid, Texture};
+use crate::trace::{Facets, Solid, Texture};
 
 /// Bodies of a tagged object and of the housing of its tag.
 pub fn object_bodies(
@@ -35,7 +38,9 @@ pub fn object_bodies(
         },
         Shape::Sphere { diameter } => Solid::Sphere(0.5 * *diameter as f32),
         Shape::Prism { .. } | Shape::Convex { .. } => {
-            return Err(SimError::Shape(record.object_id.to_string()));
+            let faces = faces(&record.shape);
+            let faces = faces.ok_or_else(|| SimError::Shape(record.object_id.to_string()))?;
+            Solid::Faceted(Arc::new(Facets::new(&faces)))
         }
     };
     let surface = material(settings.surface, &solid, rng);

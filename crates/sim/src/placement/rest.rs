@@ -8,6 +8,10 @@ use rand_pcg::Pcg64Mcg;
 use vergence_tag::Shape;
 
 use crate::config::ObjectSettings;
+use crate::faces;
+
+/// An object lies on a face that holds the foot of its middle by as much (m): less, and it tips over.
+const STABLE: f64 = 0.004;
 
 /// How an object stands on the table.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -47,9 +51,21 @@ impl Rest {
                 let across = (1.0 - z * z).sqrt();
                 (Vector3::new(across * azimuth.cos(), across * azimuth.sin(), z), 0.5 * diameter)
             }
-            Shape::Box | Shape::Prism { .. } | Shape::Convex { .. } => {
+            Shape::Box => {
                 let (axis, sign) = (rng.random_range(0..3), [-1.0, 1.0][rng.random_range(0..2)]);
                 (Vector3::ith(axis, sign), 0.5 * sides[axis])
+            }
+            Shape::Prism { .. } | Shape::Convex { .. } => {
+                let mut lies =
+                    faces::faces(&record.shape).map_or_else(Vec::new, |f| faces::outermost(&f));
+                lies.retain(|face| face.margin() > STABLE);
+                match lies.len() {
+                    0 => (-Vector3::z(), 0.5 * sides[2]),
+                    n => {
+                        let face = &lies[rng.random_range(0..n)];
+                        (face.normal, face.offset())
+                    }
+                }
             }
         };
         let over = || UnitQuaternion::from_axis_angle(&Vector3::x_axis(), PI);

@@ -11,6 +11,7 @@
 // One index runs over the lanes of several arrays at once; iterators would hide that.
 #![allow(clippy::needless_range_loop)]
 
+mod facets;
 mod lightmap;
 mod packet;
 mod render;
@@ -18,6 +19,7 @@ mod shade;
 mod shape;
 mod texture;
 
+pub use facets::Facets;
 pub use packet::{LANES, V3};
 pub use render::{RayGrid, Rendering, render};
 pub use shade::{clear_share, is_clear};

@@ -156,7 +156,7 @@ fn surfaces(scene: &Scene, packet: &Packet, pixel: f32) -> [Surface; LANES] {
             local[k][i] = p[k];
             normals[k][i] = n[k];
         }
-        plain[i] = part >= part::TOP && !matches!(body.placed.solid, Solid::Box(_));
+        plain[i] = part >= part::TOP && body.placed.solid.is_round();
         let kind = match (body.mirror, body.shadow) {
             (true, _) if normal[2] > 0.9 => Kind::Table,
             (_, true) => Kind::Object,
@@ -178,12 +178,13 @@ fn surfaces(scene: &Scene, packet: &Packet, pixel: f32) -> [Surface; LANES] {
         let index = surfaces[i].body;
         let body = &scene.bodies[index];
         let material = &body.material;
-        let extent = match body.placed.solid {
-            Solid::Box(half) => Extent::Flat(half),
+        let extent = match &body.placed.solid {
+            Solid::Box(half) => Extent::Flat(*half),
+            Solid::Faceted(facets) => Extent::Flat(facets.half()),
             Solid::Frustum { bottom, top, .. } | Solid::Cup { bottom, top, .. } => {
                 Extent::Round(0.5 * (bottom + top))
             }
-            Solid::Sphere(radius) | Solid::Capsule { radius, .. } => Extent::Round(radius),
+            Solid::Sphere(radius) | Solid::Capsule { radius, .. } => Extent::Round(*radius),
         };
         let factors = material.texture.factors(&local, &normals, extent, &footprint, material.seed);
         for j in i..LANES {

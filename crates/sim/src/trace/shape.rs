@@ -4,15 +4,18 @@
 //! ray is taken to the solid's own frame, where every solid is centred on the origin and its axis
 //! is z.
 
+use std::sync::Arc;
+
 use nalgebra::{Point3, Vector3};
 use vergence_geometry::Transform;
 
+use super::facets::Facets;
 use super::packet::{
     LANES, Lane, Lane3, NEAR, Packet, V3, add_scaled, dot, normalize, scaled, sub,
 };
 
 /// Form of a solid; lengths in metres.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum Solid {
     /// Half sides.
     Box([f32; 3]),
@@ -45,9 +48,19 @@ pub enum Solid {
         /// Radius.
         radius: f32,
     },
+    /// A prism or a convex body.
+    Faceted(Arc<Facets>),
 }
 
-/// Part numbers of round solids; the parts of a box are told from the point.
+impl Solid {
+    /// Whether its wall is round.
+    pub fn is_round(&self) -> bool {
+        !matches!(self, Solid::Box(_) | Solid::Faceted(_))
+    }
+}
+
+/// Part numbers of round solids; the parts of a box are told from the point, those of other flat bodies
+/// are their facets.
 pub mod part {
     /// Outer wall, or the only surface.
     pub const SIDE: u32 = 0;
@@ -81,12 +94,13 @@ impl Placed {
             [axis.x as f32, axis.y as f32, axis.z as f32]
         });
         let c = base_from_body.translation.vector;
-        let bound = match solid {
-            Solid::Box(half) => dot(half, half).sqrt(),
+        let bound = match &solid {
+            Solid::Box(half) => dot(*half, *half).sqrt(),
             Solid::Frustum { bottom, top, half } | Solid::Cup { bottom, top, half, .. } => {
-                bottom.max(top).hypot(half)
+                bottom.max(*top).hypot(*half)
             }
-            Solid::Sphere(radius) => radius,
+            Solid::Faceted(facets) => dot(facets.half(), facets.half()).sqrt(),
+            Solid::Sphere(radius) => *radius,
             Solid::Capsule { half, radius } => half + radius,
         };
         Placed { solid, rotation, centre: [c.x as f32, c.y as f32, c.z as f32], bound }
@@ -132,16 +146,18 @@ impl Placed {
         add_scaled(add_scaled(scaled(x, v[0]), y, v[1]), z, v[2])
     }
 
-    /// True when a point (base frame) lies within the solid grown by `margin`; hollows count as in.
+    /// True when a point (base frame) lies within the solid grown by `margin`; hollows count as in, and so
+    /// does all of the box around facets.
     pub fn contains(&self, p: &Point3<f64>, margin: f32) -> bool {
         let [x, y, z] = self.local([p.x as f32, p.y as f32, p.z as f32]);
         let rho = x.hypot(y);
-        match self.solid {
-            Solid::Box(h) => {
-                x.abs() < h[0] + margin && y.abs() < h[1] + margin && z.abs() < h[2] + margin
-            }
+        let within =
+            |h: V3| x.abs() < h[0] + margin && y.abs() < h[1] + margin && z.abs() < h[2] + margin;
+        match &self.solid {
+            Solid::Box(half) => within(*half),
+            Solid::Faceted(facets) => within(facets.half()),
             Solid::Frustum { bottom, top, half } | Solid::Cup { bottom, top, half, .. } => {
-                z.abs() < half + margin && rho < bottom.max(top) + margin
+                z.abs() < half + margin && rho < bottom.max(*top) + margin
             }
             Solid::Sphere(radius) => rho.hypot(z) < radius + margin,
             Solid::Capsule { half, radius } => {
@@ -153,7 +169,8 @@ impl Placed {
     /// Outward normal in the solid's frame at a surface point of it, and the part hit.
     #[inline(always)]
     pub fn normal(&self, p: V3, part: u32) -> (V3, u32) {
-        match self.solid {
+        match &self.solid {
+            Solid::Faceted(facets) => (facets.normal(part), part),
             Solid::Box(h) => {
                 let q = [p[0].abs() - h[0], p[1].abs() - h[1], p[2].abs() - h[2]];
                 let k = (0..3).fold(0, |best, k| if q[k] > q[best] { k } else { best });
@@ -175,7 +192,7 @@ impl Placed {
             }
             Solid::Sphere(_) => (normalize(p), part),
             Solid::Capsule { half, .. } => {
-                (normalize([p[0], p[1], p[2] - p[2].clamp(-half, half)]), part)
+                (normalize([p[0], p[1], p[2] - p[2].clamp(-*half, *half)]), part)
             }
         }
     }
@@ -197,14 +214,15 @@ impl Placed {
         }
         let mut best = packet.t;
         let mut part = [0u32; LANES];
-        match self.solid {
-            Solid::Box(half) => slabs(&o, &d, half, &mut best),
-            Solid::Frustum { bottom, top, half } => {
+        match &self.solid {
+            Solid::Faceted(facets) => facets.intersect(&o, &d, &mut best, &mut part),
+            &Solid::Box(half) => slabs(&o, &d, half, &mut best),
+            &Solid::Frustum { bottom, top, half } => {
                 cone(&o, &d, [bottom, top], [-half, half], part::SIDE, &mut best, &mut part);
                 disc(&o, &d, -half, [0.0, bottom], part::BOTTOM, &mut best, &mut part);
                 disc(&o, &d, half, [0.0, top], part::TOP, &mut best, &mut part);
             }
-            Solid::Cup { bottom, top, half, wall } => {
+            &Solid::Cup { bottom, top, half, wall } => {
                 let floor = -half + wall;
                 let foot = bottom + (top - bottom) * wall / (2.0 * half) - wall;
                 cone(&o, &d, [bottom, top], [-half, half], part::SIDE, &mut best, &mut part);
@@ -213,8 +231,8 @@ impl Placed {
                 disc(&o, &d, floor, [0.0, foot], part::FLOOR, &mut best, &mut part);
                 disc(&o, &d, half, [top - wall, top], part::TOP, &mut best, &mut part);
             }
-            Solid::Sphere(radius) => ball(&o, &d, 0.0, radius, &mut best),
-            Solid::Capsule { half, radius } => {
+            &Solid::Sphere(radius) => ball(&o, &d, 0.0, radius, &mut best),
+            &Solid::Capsule { half, radius } => {
                 cone(&o, &d, [radius; 2], [-half, half], part::SIDE, &mut best, &mut part);
                 ball(&o, &d, half, radius, &mut best);
                 ball(&o, &d, -half, radius, &mut best);

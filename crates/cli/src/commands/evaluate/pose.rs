@@ -33,7 +33,8 @@ pub struct Pose {
     /// Seed of the first scene; the others follow.
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Draw objects on any side that they can rest on, balls among them, instead of standing ones.
+    /// Draw objects on any side that they can rest on, balls, prisms and convex bodies among them, instead
+    /// of standing ones.
     #[arg(long, conflicts_with = "set")]
     fallen: bool,
     /// Folder to write the scenes to that are drawn, as a pose set with its truth (docs/pose.md).
