@@ -234,14 +234,16 @@ fn results_that_cannot_be_written_are_refused_before_the_work() {
 
     // Work that fails leaves what was there, and nothing where nothing was.
     let (old, new) = (set.join("old.csv"), set.join("new.csv"));
+    let (link, linked) = (set.join("link.csv"), set.join("linked.csv"));
+    std::os::unix::fs::symlink(&linked, &link).unwrap();
     std::fs::write(&old, "kept").unwrap();
     std::fs::remove_dir_all(set.join("test/000000")).unwrap();
     std::fs::remove_file(set.join("test/000001/scene_tags.json")).unwrap();
-    for out in [&old, &new] {
+    for out in [&old, &new, &link] {
         assert_eq!(pose(out).status.code(), Some(2));
     }
     assert_eq!(std::fs::read_to_string(&old).unwrap(), "kept");
-    assert!(!new.exists());
+    assert!(!new.exists() && !linked.exists() && link.is_symlink());
 }
 
 #[test]

@@ -13,6 +13,7 @@ use vergence_head::{Noise, PanTiltHead};
 
 use crate::failure::Failure;
 use crate::light::{Person, Ruler, SimulatedPerson};
+use crate::out;
 use crate::output::{outln, told};
 use crate::progress::Progress;
 use crate::robot::{BUILT, Opened, RobotArgs, not_urdf, urdf};
@@ -110,6 +111,9 @@ pub fn run(args: &Calibrate) -> Result<bool, Failure> {
 
 /// Measures, and writes what came out if it is good.
 fn calibrate(args: &Calibrate) -> Result<Outcome, Failure> {
+    for path in [&args.out, &args.out.with_extension("urdf")] {
+        out::check(path)?;
+    }
     let robot = RobotArgs { config: Some(args.config.clone()), seed: args.seed };
     let mut opened = robot.open()?;
     keeps_what_was_read(args, &opened)?;

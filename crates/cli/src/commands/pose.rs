@@ -12,6 +12,7 @@ use vergence_imaging::codec;
 use vergence_pose::{ObjectPose, Query, Refusal, View, directional, paper};
 
 use crate::failure::Failure;
+use crate::out;
 use crate::save::{fresh, unwritten};
 use set::{Case, Purpose};
 
@@ -73,7 +74,7 @@ pub struct Outcome {
 
 /// Runs the command; `true` when at least one object was answered.
 pub fn run(args: PoseArgs) -> Result<bool, Failure> {
-    table::check(&args.out)?;
+    out::check(&args.out)?;
     let pictures = args.save.as_deref().map(Pictures::create).transpose()?;
     let worked = set::each(&args.set, args.threads, Purpose::Answers, |case| {
         Ok(recognise(case, args.method, pictures.as_ref()))
