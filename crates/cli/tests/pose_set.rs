@@ -247,6 +247,18 @@ fn results_that_cannot_be_written_are_refused_before_the_work() {
 }
 
 #[test]
+fn so_many_threads_are_misuse() {
+    for threads in ["0", "1025", "1000000"] {
+        for args in [&["pose", "set", "--out", "out"][..], &["evaluate", "pose"]] {
+            let output = vergence(&[args, &["--threads", threads]].concat());
+            let told = text(&output.stderr);
+            assert_eq!(output.status.code(), Some(2), "{told}");
+            assert!(told.contains("1..=1024"), "{told}");
+        }
+    }
+}
+
+#[test]
 fn a_set_is_compared_with_its_truth() {
     let (set, _) = set("pose-set-truth");
     let evaluate = |more: &[&str]| {

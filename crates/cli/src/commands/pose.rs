@@ -28,8 +28,8 @@ pub struct PoseArgs {
     #[arg(long, value_enum, default_value_t = Method::Directional)]
     method: Method,
     /// Scenes worked on at the same time; the times in the CSV are right only with one.
-    #[arg(long, default_value_t = 1)]
-    threads: usize,
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=set::MOST_THREADS))]
+    threads: u16,
     /// Folder for pictures of what was seen: edges, field, best and second-best pose, residuals.
     #[arg(long)]
     save: Option<PathBuf>,

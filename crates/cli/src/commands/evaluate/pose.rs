@@ -43,8 +43,8 @@ pub struct Pose {
     #[arg(long, value_enum, default_value_t = Method::Directional)]
     method: Method,
     /// Scenes worked on at the same time; the times are right only with one.
-    #[arg(long, default_value_t = 1)]
-    threads: usize,
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=set::MOST_THREADS))]
+    threads: u16,
     /// Print one JSON document.
     #[arg(long)]
     json: bool,
