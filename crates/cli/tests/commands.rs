@@ -278,6 +278,13 @@ fn poses_of_simulated_scenes_are_right_and_honest() {
     assert!(number("ellipsoid_95_coverage") >= 0.75, "{figures}");
     assert!(figures["wrong_seeds"].as_array().unwrap().len() <= 2, "{figures}");
 
+    let last = u64::MAX.to_string();
+    let output = vergence(&["evaluate", "pose", "--scenes", "2", "--seed", &last, "--json"]);
+    let figures = json(&output);
+    let refused = figures["refused"].as_object().unwrap().values().filter_map(Value::as_u64);
+    let told = figures["answered"].as_u64().unwrap() + refused.sum::<u64>();
+    assert_eq!(told, 2, "{figures}");
+
     let none = vergence(&["evaluate", "pose", "--scenes", "0"]);
     assert_eq!(none.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&none.stderr).contains("--scenes 0"));

@@ -103,9 +103,10 @@ pub fn run(args: &Pose) -> Result<bool, Failure> {
 
 /// Every simulated scene, with the seconds that its recognition took.
 fn simulation(args: &Pose) -> Result<Worked<(Outcome, f64)>, Failure> {
-    let seeds = args.seed..args.seed.saturating_add(args.scenes);
-    let results: Result<Vec<(Outcome, f64)>, Failure> = set::pool(args.threads)?
-        .install(|| seeds.into_par_iter().map(|seed| simulated(seed, args)).collect());
+    // After the largest seed comes the smallest.
+    let scene = |k: u64| simulated(args.seed.wrapping_add(k), args);
+    let results: Result<Vec<(Outcome, f64)>, Failure> =
+        set::pool(args.threads)?.install(|| (0..args.scenes).into_par_iter().map(scene).collect());
     Ok(Worked { results: results?, scenes: args.scenes as usize, bad: BTreeMap::new() })
 }
 
