@@ -267,6 +267,23 @@ fn misuse_is_two() {
     assert_eq!(vergence(&["experiment", "9"]).status.code(), Some(2));
 }
 
+/// And is not taken for an option, with the advice that goes with that.
+#[test]
+fn a_negative_number_is_told_what_should_stand_there() {
+    for (args, said) in [
+        (&["tag", "blink", "cup", "--seconds", "-1"][..], "--seconds -1:"),
+        (&["tag", "blink", "cup", "--chip-ms", "-1"], "--chip-ms -1:"),
+        (&["sim", "--seconds", "-1"], "--seconds is not a time"),
+        (&["blink", "--bound", "--minutes", "-1"], "not between 0 and"),
+        (&["calibrate", "--config", "x", "--out", "y", "--length", "-1"], "give them in metres"),
+    ] {
+        let output = vergence(args);
+        let told = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{told}");
+        assert!(told.contains(said) && !told.contains("unexpected argument"), "{told}");
+    }
+}
+
 #[test]
 fn poses_of_simulated_scenes_are_right_and_honest() {
     let output = vergence(&["evaluate", "pose", "--scenes", "24", "--seed", "1000", "--json"]);

@@ -53,7 +53,7 @@ pub struct Args {
     #[arg(long, default_value_t = 100, requires = "bound", value_parser = value_parser!(u32).range(1..=100_000))]
     runs: u32,
     /// Minutes of tag-free video for --bound
-    #[arg(long, default_value_t = 5.0, requires = "bound", value_parser = minutes)]
+    #[arg(long, default_value_t = 5.0, requires = "bound", value_parser = minutes, allow_negative_numbers = true)]
     minutes: f64,
     /// How to look
     #[arg(long, value_enum, default_value = "sequential")]
