@@ -313,4 +313,13 @@ fn scenes_that_were_drawn_and_written_are_answered_alike_when_read() {
     let again = evaluate(&["--scenes", "1", "--save", set]);
     assert_eq!(again.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&again.stderr).contains("a new folder"));
+    // The largest number of a scene, and one more.
+    for (name, scenes, status) in [("last", "1", 0), ("beyond", "2", 2)] {
+        let set = folder(&format!("pose-set-{name}"));
+        let seed = u32::MAX.to_string();
+        let args = ["--scenes", scenes, "--seed", &seed, "--save", set.to_str().unwrap()];
+        let output = evaluate(&args);
+        assert_eq!(output.status.code(), Some(status), "{}", text(&output.stderr));
+        assert_eq!(set.exists(), status == 0, "{name}");
+    }
 }

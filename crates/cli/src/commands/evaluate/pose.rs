@@ -80,6 +80,11 @@ pub fn run(args: &Pose) -> Result<bool, Failure> {
         let what = format!("{} holds a pose set already", folder.display());
         return Err(Failure::misuse(what, "give --save a new folder"));
     }
+    let last = args.seed.checked_add(args.scenes - 1);
+    if args.save.is_some() && last.is_none_or(|last| u32::try_from(last).is_err()) {
+        let what = "a scene of a pose set has its seed as its number, which is below 2^32";
+        return Err(Failure::misuse(what, "give a smaller --seed"));
+    }
     let worked = match &args.set {
         Some(set) => set::each(set, args.threads, Purpose::Comparison, |case| {
             let truth = case.truth()?;
