@@ -9,7 +9,7 @@ use std::collections::VecDeque;
 use std::fs::File;
 use std::future::poll_fn;
 use std::io::{self, Read, Write};
-use std::net::{Shutdown, TcpListener, TcpStream, ToSocketAddrs};
+use std::net::{Shutdown, TcpListener, TcpStream};
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Poll, Waker};
@@ -149,17 +149,10 @@ impl<W> Drop for StreamTransport<W> {
 }
 
 impl StreamTransport<TcpStream> {
-    /// Connects to a controller that speaks H4 over TCP. One that does not answer, or later takes no packet,
-    /// is given up after [`PATIENCE`].
+    /// Connects to a controller that speaks H4 over TCP at `host:port`. One whose name is not found, that
+    /// does not answer, or that later takes no packet is given up after [`PATIENCE`].
     pub fn connect(address: &str) -> io::Result<Self> {
-        let mut tried = Err(io::ErrorKind::NotFound.into());
-        for address in address.to_socket_addrs()? {
-            tried = TcpStream::connect_timeout(&address, PATIENCE);
-            if tried.is_ok() {
-                break;
-            }
-        }
-        let stream = tried?;
+        let stream = vergence_dial::connect(address, PATIENCE)?;
         prompt(&stream)?;
         let socket = Some(stream.try_clone()?);
         let mut transport = StreamTransport::new(stream.try_clone()?, stream);

@@ -2,6 +2,8 @@
 
 use std::fmt;
 
+use vergence_tag::Shown;
+
 /// A command that could not do its work.
 #[derive(Debug)]
 pub struct Failure {
@@ -16,13 +18,21 @@ pub struct Failure {
 impl Failure {
     /// The user asked for something that cannot be: exit status 2.
     pub fn misuse(message: impl fmt::Display, hint: impl fmt::Display) -> Self {
-        Failure { message: message.to_string(), hint: hint.to_string(), status: 2 }
+        Failure { message: shown(message), hint: hint.to_string(), status: 2 }
     }
 
     /// The thing asked for was not achieved: exit status 1.
     pub fn failed(message: impl fmt::Display, hint: impl fmt::Display) -> Self {
-        Failure { message: message.to_string(), hint: hint.to_string(), status: 1 }
+        Failure { message: shown(message), hint: hint.to_string(), status: 1 }
     }
+}
+
+/// What happened, with nothing in it that a terminal would obey but the ends of lines: parsers quote files
+/// that anybody may have written.
+fn shown(message: impl fmt::Display) -> String {
+    let message = message.to_string();
+    let lines: Vec<String> = message.lines().map(|line| Shown(line).to_string()).collect();
+    lines.join("\n")
 }
 
 impl fmt::Display for Failure {
@@ -32,3 +42,17 @@ impl fmt::Display for Failure {
 }
 
 impl std::error::Error for Failure {}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_file_holds_does_not_steer_the_terminal() {
+        let text = "kind = \"\u{1b}[2Jbox\"\n       ^ unknown";
+        let told = "kind = \"\\u{1b}[2Jbox\"\n       ^ unknown";
+        for failure in [Failure::misuse(text, "hint"), Failure::failed(text, "hint")] {
+            assert_eq!(failure.message, told);
+        }
+    }
+}

@@ -11,6 +11,7 @@ mod drivers;
 mod failure;
 mod interrupt;
 mod light;
+mod out;
 mod output;
 mod progress;
 mod radio;

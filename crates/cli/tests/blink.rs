@@ -94,6 +94,33 @@ fn a_light_is_named_alike_in_every_run() {
 }
 
 #[test]
+fn an_episode_that_cannot_be_read_stops_no_other() {
+    let dir = Path::new(env!("CARGO_TARGET_TMPDIR")).join("blink-unreadable");
+    let _ = std::fs::remove_dir_all(&dir);
+    let [torn, silent, good] = ["0001", "0002", "0003"].map(|name| dir.join("set").join(name));
+    for folder in [&torn, &silent, &good] {
+        std::fs::create_dir_all(folder).unwrap();
+        episode(folder);
+    }
+    std::fs::write(torn.join("request.json"), "{").unwrap();
+    std::fs::remove_file(silent.join("recording.mcap")).unwrap();
+    let answers = dir.join("answers");
+    std::fs::create_dir(&answers).unwrap();
+    // An earlier run could still read it.
+    std::fs::write(answers.join("0001.json"), "{}").unwrap();
+    let (set, out) = (dir.join("set"), answers.to_str().unwrap());
+    let output = vergence(&["blink", "--episodes", set.to_str().unwrap(), "--out", out]);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("0001: ") && said.contains("0002: "), "{said}");
+    assert!(said.contains("2 of 3 episodes"), "{said}");
+    let answered = [("0001", false), ("0002", false), ("0003", true)];
+    for (name, there) in answered {
+        assert_eq!(answers.join(format!("{name}.json")).exists(), there, "{name}: {said}");
+    }
+}
+
+#[test]
 fn options_without_effect_are_misuse() {
     for args in [
         &["--bound", "--runs", "0"][..],

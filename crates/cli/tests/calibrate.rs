@@ -97,3 +97,23 @@ fn what_was_read_is_not_written_over() {
     assert!(read() == before);
     std::fs::remove_dir_all(&folder).unwrap();
 }
+
+#[test]
+fn what_cannot_be_written_is_refused_before_the_measurement() {
+    let folder = perturbed("calibrate-unwritable");
+    // The configuration could be written, the URDF beside it not.
+    std::fs::create_dir(folder.join("taken.urdf")).unwrap();
+    std::fs::write(folder.join("kept.toml"), "kept").unwrap();
+    std::fs::create_dir(folder.join("kept.urdf")).unwrap();
+    for out in ["nowhere/better.toml", "taken.toml", "kept.toml"] {
+        // No such tag: a measurement that begins fails with other words.
+        let arguments = ["--config", "robot.toml", "--object", "nobody", "--out", out];
+        let (status, told) = vergence(&folder, &[&["calibrate"][..], &arguments].concat());
+        assert_eq!((status, told["calibrated"].as_bool()), (Some(1), Some(false)), "{told}");
+        let reason = told["reason"].as_str().unwrap();
+        assert!(reason.contains("cannot write"), "{out}: {reason}");
+    }
+    assert!(!folder.join("taken.toml").exists());
+    assert_eq!(std::fs::read_to_string(folder.join("kept.toml")).unwrap(), "kept");
+    std::fs::remove_dir_all(&folder).unwrap();
+}

@@ -267,6 +267,23 @@ fn misuse_is_two() {
     assert_eq!(vergence(&["experiment", "9"]).status.code(), Some(2));
 }
 
+/// And is not taken for an option, with the advice that goes with that.
+#[test]
+fn a_negative_number_is_told_what_should_stand_there() {
+    for (args, said) in [
+        (&["tag", "blink", "cup", "--seconds", "-1"][..], "--seconds -1:"),
+        (&["tag", "blink", "cup", "--chip-ms", "-1"], "--chip-ms -1:"),
+        (&["sim", "--seconds", "-1"], "--seconds is not a time"),
+        (&["blink", "--bound", "--minutes", "-1"], "not between 0 and"),
+        (&["calibrate", "--config", "x", "--out", "y", "--length", "-1"], "give them in metres"),
+    ] {
+        let output = vergence(args);
+        let told = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{told}");
+        assert!(told.contains(said) && !told.contains("unexpected argument"), "{told}");
+    }
+}
+
 #[test]
 fn poses_of_simulated_scenes_are_right_and_honest() {
     let output = vergence(&["evaluate", "pose", "--scenes", "24", "--seed", "1000", "--json"]);
@@ -277,6 +294,13 @@ fn poses_of_simulated_scenes_are_right_and_honest() {
     assert!(number("within_5mm_5deg") >= 0.75, "{figures}");
     assert!(number("ellipsoid_95_coverage") >= 0.75, "{figures}");
     assert!(figures["wrong_seeds"].as_array().unwrap().len() <= 2, "{figures}");
+
+    let last = u64::MAX.to_string();
+    let output = vergence(&["evaluate", "pose", "--scenes", "2", "--seed", &last, "--json"]);
+    let figures = json(&output);
+    let refused = figures["refused"].as_object().unwrap().values().filter_map(Value::as_u64);
+    let told = figures["answered"].as_u64().unwrap() + refused.sum::<u64>();
+    assert_eq!(told, 2, "{figures}");
 
     let none = vergence(&["evaluate", "pose", "--scenes", "0"]);
     assert_eq!(none.status.code(), Some(2));

@@ -234,14 +234,28 @@ fn results_that_cannot_be_written_are_refused_before_the_work() {
 
     // Work that fails leaves what was there, and nothing where nothing was.
     let (old, new) = (set.join("old.csv"), set.join("new.csv"));
+    let (link, linked) = (set.join("link.csv"), set.join("linked.csv"));
+    std::os::unix::fs::symlink(&linked, &link).unwrap();
     std::fs::write(&old, "kept").unwrap();
     std::fs::remove_dir_all(set.join("test/000000")).unwrap();
     std::fs::remove_file(set.join("test/000001/scene_tags.json")).unwrap();
-    for out in [&old, &new] {
+    for out in [&old, &new, &link] {
         assert_eq!(pose(out).status.code(), Some(2));
     }
     assert_eq!(std::fs::read_to_string(&old).unwrap(), "kept");
-    assert!(!new.exists());
+    assert!(!new.exists() && !linked.exists() && link.is_symlink());
+}
+
+#[test]
+fn so_many_threads_are_misuse() {
+    for threads in ["0", "1025", "1000000"] {
+        for args in [&["pose", "set", "--out", "out"][..], &["evaluate", "pose"]] {
+            let output = vergence(&[args, &["--threads", threads]].concat());
+            let told = text(&output.stderr);
+            assert_eq!(output.status.code(), Some(2), "{told}");
+            assert!(told.contains("1..=1024"), "{told}");
+        }
+    }
 }
 
 #[test]
@@ -299,4 +313,13 @@ fn scenes_that_were_drawn_and_written_are_answered_alike_when_read() {
     let again = evaluate(&["--scenes", "1", "--save", set]);
     assert_eq!(again.status.code(), Some(2));
     assert!(String::from_utf8_lossy(&again.stderr).contains("a new folder"));
+    // The largest number of a scene, and one more.
+    for (name, scenes, status) in [("last", "1", 0), ("beyond", "2", 2)] {
+        let set = folder(&format!("pose-set-{name}"));
+        let seed = u32::MAX.to_string();
+        let args = ["--scenes", scenes, "--seed", &seed, "--save", set.to_str().unwrap()];
+        let output = evaluate(&args);
+        assert_eq!(output.status.code(), Some(status), "{}", text(&output.stderr));
+        assert_eq!(set.exists(), status == 0, "{name}");
+    }
 }

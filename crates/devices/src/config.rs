@@ -54,6 +54,14 @@ pub enum ConfigError {
         /// What is wrong.
         source: CameraError,
     },
+    /// The camera sees too little at a time to look for anything with it.
+    #[error("[{side}.camera]: the lens sees only {narrow:.2} degrees: are fx and fy in pixels?")]
+    Narrow {
+        /// Which camera.
+        side: &'static str,
+        /// Its field of view (degrees), across or upright, whichever is less.
+        narrow: f64,
+    },
 }
 
 /// A robot's wiring.
@@ -207,6 +215,11 @@ pub struct RadioConfig {
     pub require_signature: bool,
 }
 
+/// Least field of view (degrees). The views in which a head looks for a light grow with its inverse square: at
+/// ten degrees 600 of them took a simulated head nine minutes. What is this narrow is a focal length in
+/// another unit.
+const LEAST_FIELD_DEG: f64 = 3.0;
+
 fn default_baud() -> u32 {
     1_000_000
 }
@@ -230,6 +243,12 @@ impl Config {
             camera
                 .validate()
                 .map_err(|source| ConfigError::Camera { side: side.name(), source })?;
+            let field = |pixels: usize, focal: f64| 2.0 * (0.5 * pixels as f64 / focal).atan();
+            let fields = [field(camera.width, camera.fx), field(camera.height, camera.fy)];
+            let narrow = fields[0].min(fields[1]).to_degrees();
+            if narrow < LEAST_FIELD_DEG {
+                return Err(ConfigError::Narrow { side: side.name(), narrow });
+            }
         }
         Ok(config)
     }
@@ -292,5 +311,9 @@ mod tests {
         );
         let message = Config::parse(&text, Path::new("x")).unwrap_err().to_string();
         assert!(message.starts_with("[left.camera]: camera fx"), "{message}");
+        // 240 rows of a lens that was stated in tenths of pixels.
+        let text = text.replace("fx = -1.0, fy = 300.0", "fx = 300.0, fy = 5000.0");
+        let message = Config::parse(&text, Path::new("x")).unwrap_err().to_string();
+        assert!(message.starts_with("[left.camera]: the lens sees only 2.75 degrees"), "{message}");
     }
 }

@@ -218,3 +218,44 @@ fn grid_covariance(
     covariance.fixed_view_mut::<3, 3>(3, 3).copy_from(&centre);
     covariance
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use vergence_geometry::{Camera, GaussianPoint};
+    use vergence_tag::Record;
+
+    #[test]
+    fn a_pose_is_stated_as_finely_as_its_attitude_was_tried() {
+        let text = r#"{"object_id": "box", "landmarks": [{"position": [0.05, 0.03, 0.01], "normal": [1, 0, 0]}],
+            "bounding_box": {"width": 0.10, "length": 0.16, "height": 0.07}, "shape": {"kind": "box"}}"#;
+        let record: Record = serde_json::from_str(text).unwrap();
+        // Whatever the picture shows, the method answers; a coarse grid suffices.
+        let config = Config { grid_spacing: 0.5, turn_step: 0.1, ..Config::default() };
+        let camera = Camera::centred(40, 30, 30.0);
+        let image = Image::filled(camera.width, camera.height, 90u8);
+        let view =
+            View { image: &image, camera, base_from_optical: Transform::identity(), turn_sd: 0.0 };
+        let covariance = Matrix3::identity() * 1e-6;
+        let landmark = GaussianPoint { position: Point3::new(0.0, 0.0, 0.6), covariance };
+        // The camera looks along z, so up is to its -y.
+        let vertical = Some(-Vector3::y_axis());
+        for (up, standing, step) in [
+            (vertical, Some(true), config.turn_step),
+            (vertical, None, config.turn_step),
+            (vertical, Some(false), config.grid_spacing),
+            (None, None, config.grid_spacing),
+        ] {
+            let query = Query { record: &record, landmark, landmark_index: 0, up, standing };
+            let found = recognise(&[view], &query, &config).unwrap().pose;
+            let stated = found.covariance.fixed_view::<3, 3>(0, 0) / (step * step);
+            let off = (stated - Matrix3::identity()).norm();
+            assert!(off < 1e-9, "{up:?}, {standing:?}: {stated} squared steps");
+            // The lever of a coarser turn makes the place uncertain too.
+            let lever = found.pose.rotation * Vector3::from(record.landmarks[0].position);
+            let place = found.covariance.fixed_view::<3, 3>(3, 3).trace();
+            let expected = 3e-6 + 2.0 * (step * lever.norm()).powi(2);
+            assert!((place / expected - 1.0).abs() < 1e-9, "{place} m^2, not {expected}");
+        }
+    }
+}

@@ -13,6 +13,7 @@ use vergence_head::{Noise, PanTiltHead};
 
 use crate::failure::Failure;
 use crate::light::{Person, Ruler, SimulatedPerson};
+use crate::out;
 use crate::output::{outln, told};
 use crate::progress::Progress;
 use crate::robot::{BUILT, Opened, RobotArgs, not_urdf, urdf};
@@ -37,17 +38,17 @@ pub struct Calibrate {
     #[arg(long, default_value_t = CollectConfig::default().views as u16, value_parser = clap::value_parser!(u16).range(4..=1000))]
     views: u16,
     /// Length (m) between the two places of a pair.
-    #[arg(long, default_value_t = 0.5)]
+    #[arg(long, default_value_t = 0.5, allow_negative_numbers = true)]
     length: f64,
     /// Standard deviation (m) of that length.
-    #[arg(long, default_value_t = 0.0005)]
+    #[arg(long, default_value_t = 0.0005, allow_negative_numbers = true)]
     length_sigma: f64,
     /// Each place is measured in the base frame, to --place-sigma, and asked for on the terminal: then
     /// the heads know where they stand in base.
     #[arg(long)]
     measured: bool,
     /// Standard deviation (m) of each coordinate of a measured place.
-    #[arg(long, default_value_t = 0.001)]
+    #[arg(long, default_value_t = 0.001, allow_negative_numbers = true)]
     place_sigma: f64,
     /// Seed of the simulated workcell.
     #[arg(long, default_value_t = 1)]
@@ -110,6 +111,9 @@ pub fn run(args: &Calibrate) -> Result<bool, Failure> {
 
 /// Measures, and writes what came out if it is good.
 fn calibrate(args: &Calibrate) -> Result<Outcome, Failure> {
+    for path in [&args.out, &args.out.with_extension("urdf")] {
+        out::check(path)?;
+    }
     let robot = RobotArgs { config: Some(args.config.clone()), seed: args.seed };
     let mut opened = robot.open()?;
     keeps_what_was_read(args, &opened)?;

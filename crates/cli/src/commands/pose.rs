@@ -12,6 +12,7 @@ use vergence_imaging::codec;
 use vergence_pose::{ObjectPose, Query, Refusal, View, directional, paper};
 
 use crate::failure::Failure;
+use crate::out;
 use crate::save::{fresh, unwritten};
 use set::{Case, Purpose};
 
@@ -27,8 +28,8 @@ pub struct PoseArgs {
     #[arg(long, value_enum, default_value_t = Method::Directional)]
     method: Method,
     /// Scenes worked on at the same time; the times in the CSV are right only with one.
-    #[arg(long, default_value_t = 1)]
-    threads: usize,
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=set::MOST_THREADS))]
+    threads: u16,
     /// Folder for pictures of what was seen: edges, field, best and second-best pose, residuals.
     #[arg(long)]
     save: Option<PathBuf>,
@@ -73,7 +74,7 @@ pub struct Outcome {
 
 /// Runs the command; `true` when at least one object was answered.
 pub fn run(args: PoseArgs) -> Result<bool, Failure> {
-    table::check(&args.out)?;
+    out::check(&args.out)?;
     let pictures = args.save.as_deref().map(Pictures::create).transpose()?;
     let worked = set::each(&args.set, args.threads, Purpose::Answers, |case| {
         Ok(recognise(case, args.method, pictures.as_ref()))

@@ -20,7 +20,7 @@ mod timing;
 
 use std::collections::VecDeque;
 use std::io::{BufReader, Write};
-use std::net::{Shutdown, TcpStream, ToSocketAddrs};
+use std::net::{Shutdown, TcpStream};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
@@ -36,6 +36,7 @@ use timing::Timing;
 
 /// A stream that says nothing for so long is dead.
 const SILENCE: Duration = Duration::from_secs(2);
+/// Longest wait for a connection, the look-up of the host's name included.
 const CONNECT: Duration = Duration::from_secs(2);
 /// Wait between attempts to connect.
 const RETRY: Duration = Duration::from_millis(200);
@@ -240,22 +241,13 @@ impl Target {
 
     /// Connects and asks; the answer is still to be read. HTTP 1.0, so that nothing comes in chunks.
     fn connect(&self, shared: &Shared) -> std::io::Result<TcpStream> {
-        let mut last = std::io::Error::from(std::io::ErrorKind::NotFound);
-        for address in self.host.to_socket_addrs()? {
-            match TcpStream::connect_timeout(&address, CONNECT) {
-                Ok(mut stream) => {
-                    stream.set_read_timeout(Some(SILENCE))?;
-                    stream.set_write_timeout(Some(CONNECT))?;
-                    let request =
-                        format!("GET {} HTTP/1.0\r\nHost: {}\r\n\r\n", self.path, self.host);
-                    stream.write_all(request.as_bytes())?;
-                    shared.lock().stream = Some(stream.try_clone()?);
-                    return Ok(stream);
-                }
-                Err(e) => last = e,
-            }
-        }
-        Err(last)
+        let mut stream = vergence_dial::connect(&self.host, CONNECT)?;
+        stream.set_read_timeout(Some(SILENCE))?;
+        stream.set_write_timeout(Some(CONNECT))?;
+        let request = format!("GET {} HTTP/1.0\r\nHost: {}\r\n\r\n", self.path, self.host);
+        stream.write_all(request.as_bytes())?;
+        shared.lock().stream = Some(stream.try_clone()?);
+        Ok(stream)
     }
 }
 

@@ -43,7 +43,7 @@ impl Region {
             let high = along.fold(f64::NEG_INFINITY, f64::max) + beside;
             let inside = |c: f64| c.clamp(0.0, size as f64) as usize;
             let (low, high) = (inside(low.floor()), inside(high.ceil()));
-            (high > low + 7).then_some((low, high - low))
+            (high > low + 7).then(|| (low, high - low))
         };
         let ((left, width), (top, height)) = (range(0, width)?, range(1, height)?);
         Some(Region { left, top, width, height })
@@ -266,4 +266,19 @@ fn slopes(smooth: &Image<f32>) -> (Image<f32>, Image<f32>) {
         }
     }
     (gx, gy)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_place_that_is_in_no_picture_has_no_region() {
+        let around = |x: f64, y: f64| Region::around(&[Point2::new(x, y)], 20.0, 320, 240);
+        let corner = Region { left: 0, top: 200, width: 30, height: 40 };
+        assert_eq!(around(10.0, 220.0), Some(corner));
+        for (x, y) in [(-30.0, 100.0), (100.0, 261.0), (1e300, 100.0), (f64::NAN, f64::NAN)] {
+            assert_eq!(around(x, y), None, "({x}, {y})");
+        }
+    }
 }

@@ -433,6 +433,34 @@ mod tests {
     }
 
     #[test]
+    fn an_edge_that_is_hidden_in_part_is_seen_in_part() {
+        // An L whose near arm hides the lower end of the far upright edge.
+        let outline = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.0], [0.0, 0.0], [0.0, 0.1], [-0.1, 0.1]];
+        let body = Polyhedron::prism(&outline, 0.2);
+        let eye = Vector3::new(1.0, -1.0, 1.0);
+        // The line of sight over the arm's far upper edge, at y = 0, ends on it at this height.
+        let least = (0.1 - 0.1 / 1.1) / (1.0 / 1.1);
+        for (fine, pieces) in [(true, FINE_PIECES), (false, COARSE_PIECES)] {
+            let mut out = Contour::new();
+            Model::Polyhedron(body.clone()).contour(&eye, fine, &mut out);
+            let upright = |p: &Vector3<f64>| p.x.abs() < 1e-9 && (p.y - 0.1).abs() < 1e-9;
+            out.retain(|s| upright(&s.from) && upright(&s.to));
+            let seen: f64 = out.iter().map(|s| (s.to - s.from).norm()).sum();
+            let rounding = 0.5 * 0.2 / pieces as f64;
+            assert!((seen - (0.1 - least)).abs() <= rounding, "{fine}: {seen} m");
+            assert!(seen > 0.0 && seen < 0.2, "{fine}: {seen} m");
+            // Each piece knows its place on the edge, whose lower end is hidden.
+            for s in &out {
+                let middle = (s.from.z + s.to.z) / 2.0;
+                let along = s.along + 0.1 / pieces as f64;
+                let [up, down] = [along - 0.1, 0.1 - along];
+                let place = if s.to.z > s.from.z { up } else { down };
+                assert!(middle > least && (middle - place).abs() < 1e-9, "{fine}: {s:?}");
+            }
+        }
+    }
+
+    #[test]
     fn a_notch_hides_its_own_floor() {
         // An L from above-left: the notch's inner corner is seen only from its open side.
         let outline = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.0], [0.0, 0.0], [0.0, 0.1], [-0.1, 0.1]];

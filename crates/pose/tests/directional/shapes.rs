@@ -127,6 +127,30 @@ fn a_can_on_its_side_rests() {
 }
 
 #[test]
+fn a_can_on_its_side_is_found_above_its_own_shadow() {
+    let shape = json!({"kind": "cylinder", "diameter": 0.066, "height": 0.12});
+    let record = record([0.066, 0.066, 0.12], shape, [0.033, 0.0, 0.02], [1.0, 0.0, 0.0]);
+    for (seed, roll, turn) in [(6, 2.2, 0.6), (7, 3.6, -0.4), (8, 2.9, 1.0)] {
+        let turn = UnitQuaternion::from_euler_angles(0.0, 0.0, turn)
+            * UnitQuaternion::from_euler_angles(FRAC_PI_2, 0.0, 0.0)
+            * UnitQuaternion::from_euler_angles(0.0, 0.0, roll);
+        // What of the wall looks down, by eighteen degrees or more, gets no light: it is as dark as the
+        // ground, and the can seems to end where that begins.
+        const DARK: f64 = 1.25;
+        let down = turn.inverse() * -Vector3::z();
+        let first = down.y.atan2(down.x) + DARK;
+        let lit = (0..=84).map(|k| first + (TAU - 2.0 * DARK) * f64::from(k) / 84.0);
+        let lit: Vec<[f64; 2]> = lit.map(|a| [0.033 * a.cos(), 0.033 * a.sin()]).collect();
+        let scene = Scene::new(&record, &[drawn(&lit, 0.12)], turn, seed);
+        let found = recognise(&scene, &record, true);
+        assert_right(&found, &scene.truth);
+        // The edge of the shadow is what such a wall is known to show.
+        let coverage = found.unwrap().coverage;
+        assert!(coverage > 0.75, "edges explain only {coverage:.2} of the contour");
+    }
+}
+
+#[test]
 fn a_ball_rests_on_any_point() {
     let shape = json!({"kind": "sphere", "diameter": 0.1});
     let record = record([0.1, 0.1, 0.1], shape, [0.05, 0.0, 0.0], [1.0, 0.0, 0.0]);
@@ -144,6 +168,33 @@ fn a_ball_rests_on_any_point() {
 }
 
 #[test]
+fn a_turn_that_nothing_tells_stays_as_it_was() {
+    // About the landmark a ball may turn as it likes, and so may a can whose landmark is in its lid.
+    let ball = json!({"kind": "sphere", "diameter": 0.1});
+    let ball = record([0.1; 3], ball, [0.0, 0.0, 0.05], [0.0, 0.0, 1.0]);
+    let can = json!({"kind": "cylinder", "diameter": 0.066, "height": 0.12});
+    let can = record([0.066, 0.066, 0.12], can, [0.0, 0.0, 0.06], [0.0, 0.0, 1.0]);
+    let drawn_as =
+        [Piece::Ball(0.05, Point3::origin()), Piece::Cylinder { radius: 0.033, half: 0.06 }];
+    for (record, piece) in [ball, can].iter().zip(drawn_as) {
+        // On its side, the landmark towards the cameras.
+        let turn = UnitQuaternion::from_euler_angles(0.0, -FRAC_PI_2, 0.3);
+        let scene = Scene::new(record, &[piece], turn, 14);
+        let off = UnitQuaternion::from_euler_angles(0.04, -0.05, 0.03);
+        let last = Transform::from_parts(scene.truth.translation, off * scene.truth.rotation);
+        for up in [true, false] {
+            let query = scene.query(record, up);
+            let found = directional::track(&scene.views(), &query, &last, &Config::default());
+            assert_right(&found, &scene.truth);
+            let rotation = found.unwrap().pose.pose.rotation;
+            let turned = (rotation * last.rotation.inverse()).scaled_axis();
+            let about = turned.dot(&(rotation * Vector3::z())).to_degrees();
+            assert!(about.abs() < 10.0, "{:?} turned by {about:.1} degrees", record.shape);
+        }
+    }
+}
+
+#[test]
 fn of_two_balls_that_touch_at_the_landmark_both_are_considered() {
     // Nothing but the landmark could say which it is, and that is seen from where they touch.
     let shape = json!({"kind": "sphere", "diameter": 0.08});
@@ -155,14 +206,34 @@ fn of_two_balls_that_touch_at_the_landmark_both_are_considered() {
     let scene = Scene::new(&record, &pieces, turn, 12);
     let query = scene.query(&record, false);
     let result = directional::recognise(&scene.views(), &query, &config);
-    let found = match &result {
+    assert_considers(&result, [Point3::origin(), other].map(|at| scene.truth * at));
+}
+
+#[test]
+fn of_two_slender_cans_that_touch_at_the_landmark_both_are_considered() {
+    // They stand nearer to each other than a turn that makes another pose moves their ends.
+    let shape = json!({"kind": "cylinder", "diameter": 0.024, "height": 0.26});
+    let record = record([0.024, 0.024, 0.26], shape, [0.012, 0.0, 0.1], [1.0, 0.0, 0.0]);
+    let turn = UnitQuaternion::from_euler_angles(0.0, 0.0, -FRAC_PI_2);
+    let places = [Point3::origin(), Point3::new(0.024, 0.0, 0.0)];
+    let pieces = places.map(|at| drawn(&regular(48, 0.012, [at.x, at.y]), 0.26));
+    let config = Config { grazing: -0.3, ..Config::default() };
+    let scene = Scene::new(&record, &pieces, turn, 13);
+    let query = scene.query(&record, true);
+    let result = directional::recognise(&scene.views(), &query, &config);
+    assert_considers(&result, places.map(|at| scene.truth * at));
+}
+
+/// Fails unless there is a pose, the best one or another, at each of two places.
+fn assert_considers(result: &Result<ObjectPose, Refusal>, places: [Point3<f64>; 2]) {
+    let found = match result {
         Ok(found) => found,
-        Err(refusal) => refusal.best_guess().unwrap(),
+        Err(refusal) => refusal.best_guess().unwrap_or_else(|| panic!("{refusal}")),
     };
-    for ball in [scene.truth * Point3::origin(), scene.truth * other] {
+    for place in places {
         let others = found.alternatives.iter().map(|other| other.pose);
-        let near = |pose: &Transform| (pose.translation.vector - ball.coords).norm() < 0.006;
-        assert!(others.chain([found.pose.pose]).any(|pose| near(&pose)), "{ball}: {found:?}");
+        let near = |pose: &Transform| (pose.translation.vector - place.coords).norm() < 0.006;
+        assert!(others.chain([found.pose.pose]).any(|pose| near(&pose)), "{place}: {found:?}");
     }
 }
 

@@ -53,7 +53,7 @@ pub struct Args {
     #[arg(long, default_value_t = 100, requires = "bound", value_parser = value_parser!(u32).range(1..=100_000))]
     runs: u32,
     /// Minutes of tag-free video for --bound
-    #[arg(long, default_value_t = 5.0, requires = "bound", value_parser = minutes)]
+    #[arg(long, default_value_t = 5.0, requires = "bound", value_parser = minutes, allow_negative_numbers = true)]
     minutes: f64,
     /// How to look
     #[arg(long, value_enum, default_value = "sequential")]
@@ -108,7 +108,8 @@ fn minutes(text: &str) -> Result<f64, String> {
 }
 
 /// Every episode of a folder; the answers go to `<out>/<episode>.json`. True when of at least
-/// one tag it is decided whether it is there, as the others are counted by who reads the answers.
+/// one tag it is decided whether it is there, as the others are counted by who reads the answers. An episode
+/// that cannot be read is told on standard error and stops no other.
 fn run_set(set: &Path, out: &Path, method: Method) -> Result<bool, Failure> {
     let unreadable = |e| Failure::misuse(format!("{}: {e}", set.display()), "name a folder");
     let mut episodes: Vec<PathBuf> = std::fs::read_dir(set)
@@ -124,14 +125,29 @@ fn run_set(set: &Path, out: &Path, method: Method) -> Result<bool, Failure> {
     std::fs::create_dir_all(out).map_err(|e| {
         Failure::failed(format!("{}: {e}", out.display()), "name a folder that can be written")
     })?;
-    let mut answered = false;
-    for episode in episodes {
+    let (mut answered, mut bad) = (false, 0);
+    for episode in &episodes {
         let (recording, request) = (episode.join("recording.mcap"), episode.join("request.json"));
-        let report = look(&recording, &request, method, None)?;
         let name = episode.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        eprintln!("{name}: {}", report.line());
-        write(&out.join(format!("{name}.json")), &report)?;
-        answered |= report.is_answered();
+        let answer = out.join(format!("{name}.json"));
+        match look(&recording, &request, method, None) {
+            Ok(report) => {
+                eprintln!("{name}: {}", report.line());
+                write(&answer, &report)?;
+                answered |= report.is_answered();
+            }
+            Err(failure) => {
+                eprintln!("{name}: {}", failure.message);
+                // What an earlier run answered would be read as this one's.
+                let _ = std::fs::remove_file(&answer);
+                bad += 1;
+            }
+        }
+    }
+    if bad > 0 {
+        let episodes = episodes.len();
+        let message = format!("{bad} of {episodes} episodes could not be read, as told above");
+        return Err(Failure::failed(message, "correct their recordings or requests"));
     }
     Ok(answered)
 }

@@ -44,8 +44,8 @@ pub struct Pose {
     #[arg(long, value_enum, default_value_t = Method::Directional)]
     method: Method,
     /// Scenes worked on at the same time; the times are right only with one.
-    #[arg(long, default_value_t = 1)]
-    threads: usize,
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=set::MOST_THREADS))]
+    threads: u16,
     /// Print one JSON document.
     #[arg(long)]
     json: bool,
@@ -81,6 +81,11 @@ pub fn run(args: &Pose) -> Result<bool, Failure> {
         let what = format!("{} holds a pose set already", folder.display());
         return Err(Failure::misuse(what, "give --save a new folder"));
     }
+    let last = args.seed.checked_add(args.scenes - 1);
+    if args.save.is_some() && last.is_none_or(|last| u32::try_from(last).is_err()) {
+        let what = "a scene of a pose set has its seed as its number, which is below 2^32";
+        return Err(Failure::misuse(what, "give a smaller --seed"));
+    }
     let worked = match &args.set {
         Some(set) => set::each(set, args.threads, Purpose::Comparison, |case| {
             let truth = case.truth()?;
@@ -104,9 +109,10 @@ pub fn run(args: &Pose) -> Result<bool, Failure> {
 
 /// Every simulated scene, with the seconds that its recognition took.
 fn simulation(args: &Pose) -> Result<Worked<(Outcome, f64)>, Failure> {
-    let seeds = args.seed..args.seed.saturating_add(args.scenes);
-    let results: Result<Vec<(Outcome, f64)>, Failure> = set::pool(args.threads)?
-        .install(|| seeds.into_par_iter().map(|seed| simulated(seed, args)).collect());
+    // After the largest seed comes the smallest.
+    let scene = |k: u64| simulated(args.seed.wrapping_add(k), args);
+    let results: Result<Vec<(Outcome, f64)>, Failure> =
+        set::pool(args.threads)?.install(|| (0..args.scenes).into_par_iter().map(scene).collect());
     Ok(Worked { results: results?, scenes: args.scenes as usize, bad: BTreeMap::new() })
 }
 

@@ -30,6 +30,10 @@ const OBJECT: u32 = 1;
 /// Most by which a number of `cam_K` that must be zero or one may be off: rounding.
 const K_ROUNDING: f64 = 1e-9;
 
+/// Most scenes worked on at the same time: more than any processor has cores, and as many threads as any
+/// system starts.
+pub const MOST_THREADS: i64 = 1024;
+
 /// One tag in one image: what is to be recognised.
 pub struct Case<'a> {
     /// The scene's number.
@@ -122,7 +126,7 @@ struct TruthEntry {
 /// on standard error and stops nothing else.
 pub fn each<T: Send>(
     set: &Path,
-    threads: usize,
+    threads: u16,
     purpose: Purpose,
     work: impl Fn(&Case) -> Result<T, Failure> + Sync,
 ) -> Result<Worked<T>, Failure> {
@@ -161,9 +165,9 @@ impl<T> Worked<T> {
     }
 }
 
-/// Threads for as many scenes at a time; at least one.
-pub fn pool(threads: usize) -> Result<rayon::ThreadPool, Failure> {
-    let builder = rayon::ThreadPoolBuilder::new().num_threads(threads.max(1));
+/// Threads for as many scenes at a time.
+pub fn pool(threads: u16) -> Result<rayon::ThreadPool, Failure> {
+    let builder = rayon::ThreadPoolBuilder::new().num_threads(threads.into());
     builder.build().map_err(|e| Failure::failed(e, "ask for fewer --threads"))
 }
 

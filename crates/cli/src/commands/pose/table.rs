@@ -2,24 +2,11 @@
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
-use std::fs::{self, File};
 use std::path::Path;
 
 use super::Outcome;
 use crate::failure::Failure;
-
-/// Refuses a file that cannot be written, before the work; what is in it stays as it is.
-pub fn check(path: &Path) -> Result<(), Failure> {
-    let new = match path.metadata() {
-        // Who reads a pipe would take the trial for its end.
-        Ok(there) if !there.is_file() && !there.is_dir() => return Ok(()),
-        there => there.is_err(),
-    };
-    let opened = File::options().append(true).create(true).open(path);
-    opened
-        .and_then(|_| if new { fs::remove_file(path) } else { Ok(()) })
-        .map_err(|e| refused(path, e))
-}
+use crate::out::refused;
 
 /// Writes the BOP results CSV: one row an object that was answered, `t` in millimetres. All rows of an image
 /// have its whole time, as BOP wants it.
@@ -50,7 +37,7 @@ pub fn write(path: &Path, outcomes: &[Outcome]) -> Result<(), Failure> {
             seconds[&(outcome.scene, outcome.image)],
         );
     }
-    fs::write(path, text).map_err(|e| refused(path, e))
+    std::fs::write(path, text).map_err(|e| refused(path, e))
 }
 
 /// Tells people on standard error what came out.
@@ -80,11 +67,4 @@ fn seconds(outcomes: &[Outcome]) -> BTreeMap<(u32, u32), f64> {
         *seconds.entry((outcome.scene, outcome.image)).or_default() += outcome.seconds;
     }
     seconds
-}
-
-fn refused(path: &Path, error: std::io::Error) -> Failure {
-    Failure::failed(
-        format!("cannot write {}: {error}", path.display()),
-        "give --out a file that can be written, in a folder that exists",
-    )
 }
