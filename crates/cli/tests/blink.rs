@@ -111,7 +111,7 @@ fn an_episode_that_cannot_be_read_stops_no_other() {
     let (set, out) = (dir.join("set"), answers.to_str().unwrap());
     let output = vergence(&["blink", "--episodes", set.to_str().unwrap(), "--out", out]);
     let said = String::from_utf8_lossy(&output.stderr);
-    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert_eq!(output.status.code(), Some(2), "{said}");
     assert!(said.contains("0001: ") && said.contains("0002: "), "{said}");
     assert!(said.contains("2 of 3 episodes"), "{said}");
     let answered = [("0001", false), ("0002", false), ("0003", true)];

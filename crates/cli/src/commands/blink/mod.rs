@@ -125,7 +125,7 @@ fn run_set(set: &Path, out: &Path, method: Method) -> Result<bool, Failure> {
     std::fs::create_dir_all(out).map_err(|e| {
         Failure::failed(format!("{}: {e}", out.display()), "name a folder that can be written")
     })?;
-    let (mut answered, mut bad) = (false, 0);
+    let (mut answered, mut bad) = (false, Vec::new());
     for episode in &episodes {
         let (recording, request) = (episode.join("recording.mcap"), episode.join("request.json"));
         let name = episode.file_name().unwrap_or_default().to_string_lossy().into_owned();
@@ -140,14 +140,15 @@ fn run_set(set: &Path, out: &Path, method: Method) -> Result<bool, Failure> {
                 eprintln!("{name}: {}", failure.message);
                 // What an earlier run answered would be read as this one's.
                 let _ = std::fs::remove_file(&answer);
-                bad += 1;
+                bad.push(failure);
             }
         }
     }
-    if bad > 0 {
-        let episodes = episodes.len();
+    if let Some(first) = bad.first() {
+        let (bad, episodes) = (bad.len(), episodes.len());
         let message = format!("{bad} of {episodes} episodes could not be read, as told above");
-        return Err(Failure::failed(message, "correct their recordings or requests"));
+        let hint = "correct their recordings or requests".into();
+        return Err(Failure { message, hint, status: first.status });
     }
     Ok(answered)
 }
