@@ -87,6 +87,31 @@ fn a_mirror_is_a_second_place_less_bright() {
 }
 
 #[test]
+fn a_reflection_is_not_taken_for_the_light_because_it_is_decided_first() {
+    let pattern = codebook::assign(0, 30.0).unwrap();
+    let request = Request { id: "a".into(), pattern, clock_tolerance: 2e-4 };
+    for step in 0..40 {
+        let phase = pattern.period().as_secs_f64() * f64::from(step) / 40.0;
+        let at = |y: f64, amplitude: f64| {
+            let light = light(&request, 30.3, y, amplitude);
+            Light { phase, rate: 1.0, ..light }
+        };
+        let lights = vec![at(14.8, 3000.0), at(52.1, 14.0)];
+        let scene = Scene { lights, exposure: 0.004, ..Scene::flat(SIDE, SIDE) };
+        let mut finder = SequentialFinder::new(vec![request.clone()], Default::default()).unwrap();
+        let mut film = scene.film(7);
+        for _ in 0..60 {
+            finder.push(&film.next_frame().unwrap()).unwrap();
+            if finder.is_done() {
+                break;
+            }
+        }
+        let found = place(&finder.decisions()[0]).expect("a light like this is found");
+        assert!((found - scene.lights[0].place).norm() < 0.5, "{found} at phase {phase:.3} s");
+    }
+}
+
+#[test]
 fn an_empty_scene_is_said_to_be_empty() {
     let requests = [request("a", "10", 83.0), request("b", "1110010", 60.0)];
     let finder = watch(&Scene::textured(SIDE, SIDE, 9), &requests, 150, 2);

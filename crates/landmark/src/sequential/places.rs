@@ -18,6 +18,8 @@ pub struct Watch {
     pub level: f64,
     /// Frame count at which to weigh it again.
     pub due: usize,
+    /// Frame count at which it first passed every test.
+    pub stood: Option<usize>,
 }
 
 /// A place of the list.
@@ -63,7 +65,10 @@ impl Places {
 
     /// Adds requests at a pixel, to be weighed at once unless they are watched there already.
     pub fn add(&mut self, pixel: (usize, usize), requests: impl Iterator<Item = usize>) {
-        self.merge(pixel, requests.map(|request| Watch { request, level: 0.0, due: 0 }));
+        self.merge(
+            pixel,
+            requests.map(|request| Watch { request, level: 0.0, due: 0, stood: None }),
+        );
     }
 
     fn merge(&mut self, pixel: (usize, usize), watches: impl IntoIterator<Item = Watch>) {

@@ -51,6 +51,14 @@ const GHOST: (f64, f64) = (16.0, 0.3);
 /// between pixels.
 const CLOSER: f64 = 0.5;
 
+/// A place of whose changes a request explains this share is likely to play it: a foreign code that
+/// resembles it shows less.
+const LIKELY: f64 = 0.8;
+
+/// A place that passes every test waits for a brighter one that is likely to play the request this share of
+/// the frames so far: of a light and its reflection the dim one is as often decided first.
+const PATIENCE: f64 = 0.5;
+
 /// Requests that are weighed at one frame where nothing is near.
 const AT_ONCE: usize = 8;
 
@@ -212,6 +220,7 @@ impl Round<'_> {
         }
         seen.sort_by(|a, b| b.evidence.correlation.total_cmp(&a.evidence.correlation));
         let mut kept: Vec<Sighting> = Vec::new();
+        let mut brighter = false;
         for candidate in seen {
             if kept.len() == MOST_PLACES {
                 break;
@@ -233,8 +242,19 @@ impl Round<'_> {
             };
             // Ville's bound is that of the first time; no need to pass again.
             let decided = before.iter().any(|s| (s.pixel - pixel).norm() < ONE_LIGHT);
-            if kept.iter().any(ghost) || !(decided || self.stands(request, &sharp, banks)) {
+            if kept.iter().any(ghost) {
                 continue;
+            }
+            if !decided {
+                if !self.stands(request, &sharp, banks) {
+                    let explained = sharp.evidence.correlation.powi(2);
+                    brighter |= explained > LIKELY * sharp.series.energy;
+                    continue;
+                }
+                let since = *places[p].watches[w].stood.get_or_insert(self.frames);
+                if brighter && ((self.frames - since) as f64) < PATIENCE * since as f64 {
+                    continue;
+                }
             }
             kept.push(self.sighting(request, &sharp));
         }
