@@ -156,6 +156,43 @@ fn a_user_edits_the_workcell() {
 }
 
 /// Devices that are not there, and output that cannot be kept: exit status 1 comes with its reason.
+/// Finds an object in the built-in workcell as edited, which must succeed; how far off the position is (m).
+fn found_in_edited(name: &str, edit: impl Fn(&str) -> String, find: &[&str]) -> f64 {
+    let dir = folder(name);
+    assert_eq!(vergence(&["workcell", dir.to_str().unwrap()]).status.code(), Some(0));
+    let path = dir.join("workcell.toml");
+    let text = std::fs::read_to_string(&path).unwrap();
+    let edited = edit(&text);
+    assert_ne!(text, edited);
+    std::fs::write(&path, edited).unwrap();
+    let config = ["--config", path.to_str().unwrap(), "--json"];
+    let report = json(&vergence(&[&["find"], find, &config].concat()));
+    assert_eq!(report["found"], true, "{report}");
+    distance(&report["pose"]["position"], &report["truth"]["position"])
+}
+
+#[test]
+fn a_light_thirty_times_white_is_found_and_not_its_reflection() {
+    let edit = |text: &str| text.replace("flux_px = 4.0", "flux_px = 30.0");
+    let off = found_in_edited("bright", edit, &["cup", "--seed", "8"]);
+    assert!(off < 0.01, "{off} m");
+}
+
+#[test]
+fn an_angle_iron_is_found() {
+    let iron = r#"
+[[sim.objects]]
+surface = "printed"
+[sim.objects.record]
+object_id = "iron"
+bounding_box = { width = 0.09, length = 0.07, height = 0.05 }
+shape = { kind = "prism", outline = [[-0.045, -0.035], [0.045, -0.035], [0.045, -0.005], [-0.015, -0.005], [-0.015, 0.035], [-0.045, 0.035]], height = 0.05 }
+landmarks = [{ position = [0.0, -0.036, 0.0], normal = [0.0, -1.0, 0.0] }]
+"#;
+    let off = found_in_edited("iron", |text| text.to_owned() + iron, &["iron", "--seed", "2"]);
+    assert!(off < 0.01, "{off} m");
+}
+
 #[test]
 fn what_fails_under_json_says_why() {
     let dir = folder("failing");

@@ -26,7 +26,7 @@ impl Run<'_> {
         pattern: &Pattern,
         seen: [Seen; 2],
     ) -> Result<[Fixation; 2], Stop> {
-        let mut held = self.same_light(&seen);
+        let mut held = self.same_light([&seen[0], &seen[1]]);
         let mut fixators = [0, 1].map(|k| {
             let servos = &self.system.robot.heads[k].pan_tilt;
             Fixator::new(FixatorConfig {
@@ -108,7 +108,7 @@ impl Run<'_> {
 
     /// Of all places that either head saw, the pair that can be one light: the brightest whose lines
     /// of sight meet, else the pair that comes nearest. Mirrors show the pattern elsewhere.
-    fn same_light(&self, seen: &[Seen; 2]) -> [(JointReading, Sighting); 2] {
+    pub(super) fn same_light(&self, seen: [&Seen; 2]) -> [(JointReading, Sighting); 2] {
         let noise = self.noise();
         let gap = |left: &Sighting, right: &Sighting| {
             let pair = [fixation(&seen[0].joints, left), fixation(&seen[1].joints, right)];

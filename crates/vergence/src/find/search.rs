@@ -7,6 +7,9 @@ use vergence_tag::Pattern;
 
 use super::{Missing, Run, Stop};
 
+/// A light is so many times brighter than what a table shows of it; a mirror shows nearly all.
+const MUCH_BRIGHTER: f64 = 3.0;
+
 /// Where one head saw the light, at which angles.
 #[derive(Debug, Clone)]
 pub(crate) struct Seen {
@@ -24,7 +27,7 @@ impl Run<'_> {
         let mut search = Search::new(&heads, &field, None, &SearchConfig::default());
         let mut seen: [Option<Seen>; 2] = [None, None];
         let mut watched: [Option<[f64; 2]>; 2] = [None, None];
-        let mut views = 0;
+        let (mut views, mut again) = (0, false);
         loop {
             let current = self.system.joints()?.map(|j| [j.pan, j.tilt]);
             let Some(targets) = search.next(current) else { break };
@@ -37,10 +40,21 @@ impl Run<'_> {
             for (k, sightings) in sightings.into_iter().enumerate().filter(|(k, _)| due[*k]) {
                 watched[k] = Some(targets[k]);
                 views += 1;
-                if let Some(brightest) = sightings.first() {
-                    search.sighted(k, [joints[k].pan, joints[k].tilt], &brightest.pixel);
-                    seen[k] = Some(Seen { joints: joints[k], sightings });
+                let Some(brightest) = sightings.first().map(|s| s.pixel) else { continue };
+                let new = Seen { joints: joints[k], sightings };
+                match seen[1 - k].as_ref().and_then(|other| self.reflection(k, &new, other)) {
+                    // The view shows the reflection only.
+                    Some(side) if side == k => continue,
+                    // Once: of two lights alike, neither can convict the other for ever.
+                    Some(_) if !again => {
+                        again = true;
+                        seen[1 - k] = None;
+                        search = Search::new(&heads, &field, None, &SearchConfig::default());
+                    }
+                    _ => {}
                 }
+                search.sighted(k, [joints[k].pan, joints[k].tilt], &brightest);
+                seen[k] = Some(new);
             }
             if let [Some(left), Some(right)] = &seen {
                 return Ok([left.clone(), right.clone()]);
@@ -52,5 +66,17 @@ impl Run<'_> {
             _ => Missing::One(Side::Right),
         };
         Err(Stop::NotSeen { views, missing })
+    }
+
+    /// Which head saw nothing but a reflection: what the heads saw of one and the same place, by head `k`
+    /// and by the other, is far from the brightest that one of them saw.
+    fn reflection(&self, k: usize, new: &Seen, other: &Seen) -> Option<usize> {
+        let seen = if k == 0 { [new, other] } else { [other, new] };
+        let common = self.same_light(seen);
+        let brighter = |side: &usize| {
+            let brightest = seen[*side].sightings.iter().map(|s| s.amplitude).fold(0.0, f64::max);
+            brightest > MUCH_BRIGHTER * common[*side].1.amplitude
+        };
+        (0..2).find(brighter).map(|side| 1 - side)
     }
 }
