@@ -31,6 +31,9 @@ const OWN_NOISE: f64 = 1.5;
 /// of the light falls into an exposure, they show two thirds of it.
 const COARSE: f64 = 0.6;
 
+/// Amplitude (grey levels) from which a light may be too bright for the picture.
+const WHITE: f64 = 100.0;
+
 /// Degrees of freedom from which what is left over tells the noise.
 const FREE: f64 = 10.0;
 
@@ -163,20 +166,24 @@ pub fn weigh(series: &Series, bank: &Bank, floor: f64, scratch: &mut Vec<f32>) -
     if coarse.log_ratio < COARSE * floor {
         return Some(coarse);
     }
-    let (best, kept) = best(series, bank, bank.hypotheses.len(), scratch)?;
+    let (mut best, mut kept) = self::best(series, bank, bank.plain, scratch)?;
+    if best.amplitude() > WHITE {
+        (best, kept) = self::best(series, bank, bank.hypotheses.len(), scratch)?;
+    }
     if best.log_ratio < floor {
         return Some(best);
     }
+    let white = scratch.len() > bank.plain;
     let (mut sum, mut restless_sum) = (0.0, 0.0);
     for (k, c) in scratch.iter().enumerate().filter(|(_, c)| **c > 0.0) {
         let (c, norm2) = (f64::from(*c), scaled(bank, &kept, k).norm2);
         let (log_ratio, restless) = log_ratios(series, best.correlation, c, norm2);
-        sum += (log_ratio - best.log_ratio).exp();
-        restless_sum += (restless - best.restless).exp();
+        let prior = bank.prior(&bank.hypotheses[k], white);
+        sum += prior * (log_ratio - best.log_ratio).exp();
+        restless_sum += prior * (restless - best.restless).exp();
     }
-    let count = bank.hypotheses.len() as f64;
-    let log_ratio = best.log_ratio + (sum / count).ln();
-    Some(Evidence { log_ratio, restless: best.restless + (restless_sum / count).ln(), ..best })
+    let log_ratio = best.log_ratio + sum.ln();
+    Some(Evidence { log_ratio, restless: best.restless + restless_sum.ln(), ..best })
 }
 
 /// The best of the first `count` hypotheses, and what the surroundings leave of each; `scratch` holds
@@ -272,7 +279,8 @@ pub fn refined_gain(
     at(&refine(series, pattern, times, nuisance, start, step)) - at(&start)
 }
 
-/// The best phase between those of the bank: golden-section search around the best one.
+/// The best phase between those of the bank: golden-section search around the best one. Where the best is
+/// that of a light too bright for the picture, one that is not may be better once its phase fits.
 pub fn refine(
     series: &Series,
     pattern: &Pattern,
@@ -280,6 +288,29 @@ pub fn refine(
     nuisance: &Nuisance,
     start: Evidence,
     step: f64,
+) -> Evidence {
+    let from =
+        |start: Evidence, reach: f64| between(series, pattern, times, nuisance, start, reach);
+    let found = from(start, step);
+    if start.best.excess == 1.0 {
+        return found;
+    }
+    let best = Hypothesis { excess: 1.0, ..start.best };
+    let plain = from(Evidence { best, correlation: 0.0, ..start }, WHOLE * step);
+    if plain.correlation > found.correlation { plain } else { found }
+}
+
+/// Steps of a bank's phase that an exposure has where lights too bright for the picture are reckoned with.
+const WHOLE: f64 = 4.0;
+
+/// The best phase within `reach` of a hypothesis' own, or the hypothesis itself.
+fn between(
+    series: &Series,
+    pattern: &Pattern,
+    times: &[(f64, f64)],
+    nuisance: &Nuisance,
+    start: Evidence,
+    reach: f64,
 ) -> Evidence {
     let mut expected = Vec::with_capacity(times.len());
     let mut at = |phase: f64| {
@@ -291,7 +322,7 @@ pub fn refine(
         Evidence { best, correlation, ..start }
     };
     let ratio = 0.5 * (5f64.sqrt() - 1.0);
-    let (mut low, mut high) = (start.best.phase - step, start.best.phase + step);
+    let (mut low, mut high) = (start.best.phase - reach, start.best.phase + reach);
     let inner = |low: f64, high: f64| (high - ratio * (high - low), low + ratio * (high - low));
     let (a, b) = inner(low, high);
     let (mut left, mut right) = (at(a), at(b));

@@ -65,6 +65,8 @@ impl Lit {
 /// How many times too bright for the picture a light is taken to be that is: half or a sixth of the
 /// exposure makes it white. What lies between is told by the phase.
 const EXCESSES: [f64; 2] = [2.0, 6.0];
+/// Chance that a light is, where it would matter: one that is has evidence to spare.
+const EXCESSIVE: f64 = 0.05;
 
 /// One phase and rate of a bank.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -95,6 +97,8 @@ pub struct Bank {
     pub hypotheses: Vec<Hypothesis>,
     /// So many come first that are a quarter of a chip apart: enough for a look.
     pub coarse: usize,
+    /// So many come before those of lights too bright for the picture.
+    pub plain: usize,
     /// Share of light, frame by frame for all hypotheses.
     templates: Vec<f32>,
     /// Frames of `templates` that have left the window.
@@ -128,6 +132,7 @@ impl Bank {
             rates.iter().flat_map(|&rate| phases.iter().map(move |&k| at(k, rate))).collect()
         };
         let mut hypotheses = [of(&first), of(&rest)].concat();
+        let plain = hypotheses.len();
         // A light so near that it is white as soon as it shines through a part of the exposure: where all
         // changes fall into exposures it seems to play another pattern.
         if is_in_step(pattern, times) {
@@ -145,10 +150,22 @@ impl Bank {
             scales: vec![0.0; hypotheses.len()],
             coarse: first.len() * rates.len(),
             hypotheses,
+            plain,
             left: 0,
             window,
             frames: 0..0,
             step,
+        }
+    }
+
+    /// Chance of a hypothesis before anything is seen, where lights too bright for the picture are reckoned
+    /// with or not.
+    pub fn prior(&self, h: &Hypothesis, white: bool) -> f64 {
+        let share = if white { EXCESSIVE } else { 0.0 };
+        if h.excess > 1.0 {
+            share / (self.hypotheses.len() - self.plain) as f64
+        } else {
+            (1.0 - share) / self.plain as f64
         }
     }
 
