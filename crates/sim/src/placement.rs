@@ -26,7 +26,7 @@ mod room;
 
 pub use bodies::object_bodies;
 use bodies::{clutter_solid, material};
-use rest::Rest;
+use rest::{Rest, lies_on};
 use room::room;
 
 /// Extent of the table top (m, base): x from, x to, |y| up to.
@@ -216,11 +216,12 @@ impl Builder {
         let record = &settings.record;
         let near = self.scenario == Scenario::Reach && record.object_id.as_str() == "cup";
         let [x0, x1, y0, y1] = if near { REACH } else { [FIELD[0], FIELD[1], -FIELD[2], FIELD[2]] };
+        let lies_on = lies_on(&record.shape);
         for _ in 0..ATTEMPTS {
             let [x, y] =
                 settings.at.unwrap_or_else(|| [rng.random_range(x0..x1), rng.random_range(y0..y1)]);
             let rest = match self.scenario {
-                Scenario::Fallen => Rest::any(settings, rng),
+                Scenario::Fallen => Rest::any(settings, &lies_on, rng),
                 _ => Rest::upright(settings),
             };
             let radius = rest.radius;

@@ -167,13 +167,13 @@ pub fn weigh(series: &Series, bank: &Bank, floor: f64, scratch: &mut Vec<f32>) -
         return Some(coarse);
     }
     let (mut best, mut kept) = self::best(series, bank, bank.plain, scratch)?;
-    if best.amplitude() > WHITE {
+    let white = best.amplitude() > WHITE && bank.plain < bank.hypotheses.len();
+    if white {
         (best, kept) = self::best(series, bank, bank.hypotheses.len(), scratch)?;
     }
     if best.log_ratio < floor {
         return Some(best);
     }
-    let white = scratch.len() > bank.plain;
     let (mut sum, mut restless_sum) = (0.0, 0.0);
     for (k, c) in scratch.iter().enumerate().filter(|(_, c)| **c > 0.0) {
         let (c, norm2) = (f64::from(*c), scaled(bank, &kept, k).norm2);

@@ -139,6 +139,11 @@ impl History {
         &self.times
     }
 
+    /// Time from the window's first frame to its last (s).
+    pub fn span(&self) -> f64 {
+        self.times.last().map_or(0.0, |l| l.0) - self.times.first().map_or(0.0, |f| f.0)
+    }
+
     /// Mean shift of the picture over the window (px).
     pub fn mean_shift(&self) -> (f64, f64) {
         let n = self.frames.len().max(1) as f64;

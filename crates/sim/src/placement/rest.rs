@@ -8,7 +8,7 @@ use rand_pcg::Pcg64Mcg;
 use vergence_tag::Shape;
 
 use crate::config::ObjectSettings;
-use crate::faces;
+use crate::faces::{self, Face};
 
 /// An object lies on a face that holds the foot of its middle by as much (m): less, and it tips over.
 const STABLE: f64 = 0.004;
@@ -24,6 +24,13 @@ pub(super) struct Rest {
     pub radius: f64,
 }
 
+/// The faces that a prism or a convex body can lie on; none of other shapes.
+pub(super) fn lies_on(shape: &Shape) -> Vec<Face> {
+    let mut lies = faces::faces(shape).map_or_else(Vec::new, |all| faces::outermost(&all));
+    lies.retain(|face| face.margin() > STABLE);
+    lies
+}
+
 impl Rest {
     /// Upright.
     pub fn upright(settings: &ObjectSettings) -> Self {
@@ -36,9 +43,10 @@ impl Rest {
         }
     }
 
-    /// On any side on which it can rest: a face, the line of a wall, any point of a ball. A cup does not
-    /// lie on its handle, so one with a handle stands on its foot or on its rim.
-    pub fn any(settings: &ObjectSettings, rng: &mut Pcg64Mcg) -> Self {
+    /// On any side on which it can rest: a face (of a prism or a convex body one of [`lies_on`]), the line of
+    /// a wall, any point of a ball. A cup does not lie on its handle, so one with a handle stands on its
+    /// foot or on its rim.
+    pub fn any(settings: &ObjectSettings, lies_on: &[Face], rng: &mut Pcg64Mcg) -> Self {
         let record = &settings.record;
         let sides = record.bounding_box.sides();
         let (down, height) = match &record.shape {
@@ -55,18 +63,13 @@ impl Rest {
                 let (axis, sign) = (rng.random_range(0..3), [-1.0, 1.0][rng.random_range(0..2)]);
                 (Vector3::ith(axis, sign), 0.5 * sides[axis])
             }
-            Shape::Prism { .. } | Shape::Convex { .. } => {
-                let mut lies =
-                    faces::faces(&record.shape).map_or_else(Vec::new, |f| faces::outermost(&f));
-                lies.retain(|face| face.margin() > STABLE);
-                match lies.len() {
-                    0 => (-Vector3::z(), 0.5 * sides[2]),
-                    n => {
-                        let face = &lies[rng.random_range(0..n)];
-                        (face.normal, face.offset())
-                    }
+            Shape::Prism { .. } | Shape::Convex { .. } => match lies_on.len() {
+                0 => (-Vector3::z(), 0.5 * sides[2]),
+                n => {
+                    let face = &lies_on[rng.random_range(0..n)];
+                    (face.normal, face.offset())
                 }
-            }
+            },
         };
         let over = || UnitQuaternion::from_axis_angle(&Vector3::x_axis(), PI);
         Rest {
@@ -134,7 +137,7 @@ mod tests {
                 yaw_deg: None,
             };
             for _ in 0..200 {
-                let rest = Rest::any(&settings, &mut rng);
+                let rest = Rest::any(&settings, &[], &mut rng);
                 let lowest = (0..720).map(|k| {
                     let angle = TAU * f64::from(k / 2) / 360.0;
                     let (z, diameter) = if k % 2 == 0 { (0.06, top) } else { (-0.06, bottom) };

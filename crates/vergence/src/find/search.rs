@@ -74,8 +74,8 @@ impl Run<'_> {
         let seen = if k == 0 { [new, other] } else { [other, new] };
         let common = self.same_light(seen);
         let brighter = |side: &usize| {
-            let brightest = seen[*side].sightings.iter().map(|s| s.amplitude).fold(0.0, f64::max);
-            brightest > MUCH_BRIGHTER * common[*side].1.amplitude
+            let brightest = seen[*side].sightings.first();
+            brightest.map_or(0.0, |s| s.amplitude) > MUCH_BRIGHTER * common[*side].1.amplitude
         };
         (0..2).find(brighter).map(|side| 1 - side)
     }

@@ -20,8 +20,7 @@ impl Banks {
     pub(super) fn own(&mut self, round: &Round, request: usize) -> &Bank {
         let Request { pattern, clock_tolerance, .. } = &round.requests[request];
         let times = round.history.times();
-        let span = times.last().map_or(0.0, |l| l.0) - times.first().map_or(0.0, |f| f.0);
-        let rates = rates(pattern, *clock_tolerance, span);
+        let rates = rates(pattern, *clock_tolerance, round.history.span());
         let slot = &mut self.own[request];
         if slot.as_ref().is_some_and(|bank| !bank.has_rates(rates.len())) {
             *slot = None;

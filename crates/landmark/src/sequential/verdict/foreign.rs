@@ -80,7 +80,6 @@ impl<'a> Rivals<'a> {
             light: Vec::new(),
         };
         light(&own.pattern, times, &evidence.best, &mut lit.light);
-        let span = times.last().map_or(0.0, |l| l.0) - times.first().map_or(0.0, |f| f.0);
         Rivals {
             requests: round.requests,
             own,
@@ -88,7 +87,7 @@ impl<'a> Rivals<'a> {
             level: 0.5 * energy / lit.noise - (own.pattern.bits.len() as f64).ln(),
             middle: (phase + rate * lit.middle()) / chip(own),
             lit,
-            span: span.min(LONGEST),
+            span: round.history.span().min(LONGEST),
             gap,
         }
     }

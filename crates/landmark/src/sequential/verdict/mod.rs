@@ -267,9 +267,7 @@ impl Round<'_> {
         // A light too bright for the picture runs chips together, and parts of codes are alike then: where
         // others are requested, all of it must have been seen.
         let period = self.requests[request].pattern.period().as_secs_f64();
-        let times = self.history.times();
-        let span = times.last().map_or(0.0, |l| l.0) - times.first().map_or(0.0, |f| f.0);
-        let whole = self.requests.len() == 1 || span >= period;
+        let whole = self.requests.len() == 1 || self.history.span() >= period;
         (seen.evidence.best.excess == 1.0 || whole)
             && self.is_present(request, seen)
             && self.leads_requests(request, seen, banks)
