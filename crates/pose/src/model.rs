@@ -79,6 +79,17 @@ pub(crate) struct Line {
     pub along: f64,
 }
 
+/// Where a ray meets an object.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Hit {
+    /// How far from the eye, in lengths of the ray's direction.
+    pub distance: f64,
+    /// Outward unit normal of the surface there.
+    pub normal: Vector3<f64>,
+    /// Which of its smooth surfaces: the same number means the same one for every eye.
+    pub part: u16,
+}
+
 impl Outline {
     fn with_capacity(count: usize) -> Self {
         Outline { points: Vec::with_capacity(count), lines: Vec::with_capacity(count) }
@@ -164,6 +175,15 @@ impl Model {
         }
     }
 
+    /// Where a ray from the eye (object frame, as the direction) first meets the object.
+    pub(crate) fn first_hit(&self, eye: &Vector3<f64>, along: &Vector3<f64>) -> Option<Hit> {
+        match self {
+            Model::Polyhedron(body) => body.first_hit(eye, along),
+            Model::Frustum(body) => body.first_hit(eye, along),
+            Model::Sphere(radius) => revolution::sphere_hit(*radius, eye, along),
+        }
+    }
+
     /// The motions of the object frame that leave its form as it is to within a tolerance (m), of a
     /// body with flat faces.
     pub fn symmetries(&self, tolerance: f64) -> Vec<Transform> {
@@ -218,5 +238,79 @@ impl Rest {
     /// On a flat face that looks this way.
     pub fn on(down: Vector3<f64>) -> Self {
         Rest { down, held: Matrix3::identity() - down * down.transpose() }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn convex_bodies() -> Vec<(Model, Vector3<f64>)> {
+        let corners = [[0.0, 0.05, 0.04], [0.05, -0.03, 0.04], [-0.04, -0.03, 0.04]];
+        let hull = corners.iter().flat_map(|c| [Vector3::from(*c), Vector3::from(*c) * -1.0]);
+        let hull: Vec<_> = hull.collect();
+        vec![
+            (
+                Model::Polyhedron(Polyhedron::cuboid(Vector3::new(0.1, 0.16, 0.06))),
+                Vector3::new(0.05, 0.08, 0.03),
+            ),
+            (Model::Polyhedron(Polyhedron::hull(&hull)), Vector3::new(0.05, 0.05, 0.04)),
+            (Model::Frustum(Frustum::new(0.04, 0.04, 0.12, false)), Vector3::new(0.04, 0.04, 0.06)),
+            (Model::Frustum(Frustum::new(0.05, 0.03, 0.1, true)), Vector3::new(0.05, 0.05, 0.05)),
+            (Model::Sphere(0.06), Vector3::repeat(0.06)),
+        ]
+    }
+
+    proptest! {
+        /// Outlines and surfaces are made in different ways: a line of sight just inside of an outline
+        /// meets the body, one just outside of it does not.
+        #[test]
+        fn lines_of_sight_meet_a_body_within_its_outline(
+            azimuth in -3.1..3.1f64, height in -1.0..1.0f64, distance in 0.4..1.5f64,
+        ) {
+            let around = Vector3::new(azimuth.cos(), azimuth.sin(), height).normalize();
+            let eye = around * distance;
+            for (model, half) in convex_bodies() {
+                let mut contour = Contour::new();
+                model.contour(&eye, true, &mut contour);
+                let outer = contour.iter().filter(|s| matches!(s.kind, Kind::Silhouette | Kind::Limb));
+                for segment in outer {
+                    let ray = segment.from.lerp(&segment.to, 0.5) - eye;
+                    // A line that is seen end on has no two sides.
+                    if (segment.to - segment.from).cross(&ray.normalize()).norm() < 0.003 {
+                        continue;
+                    }
+                    let across = (segment.to - segment.from).cross(&ray).normalize() * 0.001;
+                    let hits = [ray + across, ray - across].map(|r| (r, model.first_hit(&eye, &r)));
+                    prop_assert!(hits[0].1.is_some() != hits[1].1.is_some(), "{model:?} {segment:?}");
+                    for (ray, hit) in hits.iter().filter_map(|(r, h)| h.map(|h| (r, h))) {
+                        let p = eye + ray * hit.distance;
+                        prop_assert!(hit.normal.dot(ray) < 0.0 && (hit.normal.norm() - 1.0).abs() < 1e-9);
+                        prop_assert!((p.abs() - half).max() < 1e-9, "{p} of {model:?}");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn what_is_seen_through_an_open_top_is_no_surface() {
+        let (eye, down) = (Vector3::new(0.01, 0.0, 0.6), -Vector3::z());
+        let hit =
+            |open| Model::Frustum(Frustum::new(0.04, 0.04, 0.12, open)).first_hit(&eye, &down);
+        assert_eq!(hit(true), None);
+        assert_eq!(hit(false).map(|h| h.normal), Some(Vector3::z()));
+        assert!((hit(false).unwrap().distance - 0.54).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_notch_shows_the_surface_behind_it() {
+        let outline =
+            [[0.05, 0.05], [-0.05, 0.05], [-0.05, -0.05], [0.0, -0.05], [0.0, 0.0], [0.05, 0.0]];
+        let angle = Model::Polyhedron(Polyhedron::prism(&outline, 0.1));
+        let eye = Vector3::new(0.025, -0.5, 0.0);
+        let hit = angle.first_hit(&eye, &Vector3::y()).unwrap();
+        assert!((hit.distance - 0.5).abs() < 1e-12 && (hit.normal + Vector3::y()).norm() < 1e-9);
     }
 }

@@ -3,7 +3,7 @@
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 use vergence_geometry::Transform;
 
-use super::{Kind, Line, Outline};
+use super::{Hit, Kind, Line, Outline};
 
 /// A closed body of flat faces.
 #[derive(Debug, Clone, PartialEq)]
@@ -246,6 +246,19 @@ impl Polyhedron {
                 out.lines.push(Line { ends: [k as u16, k as u16 + 1], along, ..whole });
             }
         }
+    }
+
+    /// Where a ray from the eye first meets the body: the distance in lengths of the direction, and the
+    /// face.
+    pub(super) fn first_hit(&self, eye: &Vector3<f64>, along: &Vector3<f64>) -> Option<Hit> {
+        let faces = self.faces.iter().enumerate();
+        let hits =
+            faces.filter(|(_, face)| face.normal.dot(along) < 0.0).filter_map(|(k, face)| {
+                let distance = (face.offset - face.normal.dot(eye)) / face.normal.dot(along);
+                let met = distance > 0.0 && self.inside(face, &(eye + along * distance));
+                met.then_some(Hit { distance, normal: face.normal, part: k as u16 })
+            });
+        hits.min_by(|a, b| a.distance.total_cmp(&b.distance))
     }
 
     /// Whether some face other than the edge's own lies between a point and the eye. A line of sight

@@ -4,7 +4,7 @@ use std::f64::consts::TAU;
 
 use nalgebra::{Vector2, Vector3};
 
-use super::{Kind, Line, Outline};
+use super::{Hit, Kind, Line, Outline};
 
 /// A frustum about z, centred: cylinder or cup.
 ///
@@ -72,6 +72,30 @@ impl Frustum {
         }
     }
 
+    /// Where a ray from the eye first meets the body from outside. What is seen through an open top is
+    /// no part of it.
+    pub(super) fn first_hit(&self, eye: &Vector3<f64>, along: &Vector3<f64>) -> Option<Hit> {
+        let (slope, middle) = (self.slope(), (self.top + self.bottom) / 2.0);
+        // |x, y|^2 = radius(z)^2 along the ray.
+        let (at_eye, grows) = (middle + slope * eye.z, slope * along.z);
+        let a = along.xy().norm_squared() - grows * grows;
+        let b = eye.xy().dot(&along.xy()) - at_eye * grows;
+        let c = eye.xy().norm_squared() - at_eye * at_eye;
+        let wall = (b * b - a * c).max(-1.0).sqrt();
+        let wall = (-b - wall) / a;
+        let meets = |distance: f64| eye + along * distance;
+        if wall > 0.0 && meets(wall).z.abs() <= self.half_height {
+            let normal = self.wall(&meets(wall));
+            return Some(Hit { distance: wall, normal, part: 0 });
+        }
+        let up = eye.z.signum();
+        let (radius, part) = if up > 0.0 { (self.top, TOP) } else { (self.bottom, BOTTOM) };
+        let distance = (up * self.half_height - eye.z) / along.z;
+        let met = distance > 0.0 && meets(distance).xy().norm() <= radius;
+        let cap = met && eye.z.abs() > self.half_height && !(self.open && up > 0.0);
+        cap.then_some(Hit { distance, normal: Vector3::z() * up, part })
+    }
+
     /// One rim: where the wall below it is seen it borders cap and wall (a crease) or, with the cap
     /// turned away, wall and background; elsewhere only a visible cap shows it.
     fn rim(
@@ -100,6 +124,15 @@ impl Frustum {
 /// Numbers of the rims; the wall's two sides come before.
 const TOP: u16 = 2;
 const BOTTOM: u16 = 3;
+
+/// Where a ray from the eye first meets a ball.
+pub(super) fn sphere_hit(radius: f64, eye: &Vector3<f64>, along: &Vector3<f64>) -> Option<Hit> {
+    let (a, b) = (along.norm_squared(), eye.dot(along));
+    let root = b * b - a * (eye.norm_squared() - radius * radius);
+    let distance = (-b - root.sqrt()) / a;
+    let met = root > 0.0 && distance > 0.0;
+    met.then(|| Hit { distance, normal: (eye + along * distance) / radius, part: 0 })
+}
 
 /// A range of azimuths.
 #[derive(Clone, Copy)]
