@@ -3,8 +3,9 @@
 //!
 //! Reads top to bottom: gradients where the object can be ([`level`]), oriented edges ([`edges`]),
 //! directional fields ([`field`]), rotations that explain them ([`search`]), refinement on sub-pixel
-//! edges with several candidates a site ([`sites`], [`refine`]), and how much the best explains
-//! that a different pose would not ([`verdict`]).
+//! edges with several candidates a site ([`sites`], [`refine`]), the tops nearby and the print that both
+//! views see ([`neighbours`], [`print`]), and how much the best explains that a different pose would not
+//! ([`verdict`]).
 
 pub mod edges;
 mod equations;
@@ -13,6 +14,7 @@ pub mod landmark;
 pub mod level;
 mod neighbours;
 pub mod picture;
+pub mod print;
 pub mod refine;
 pub mod search;
 pub mod sites;
@@ -28,6 +30,7 @@ use crate::rotations;
 use crate::types::{Alternative, ObjectPose, Query, Refusal, View, check};
 use field::Field;
 use level::{Reduced, Region};
+use print::Patch;
 use refine::{FINAL, Pass, Refined};
 use search::{Search, Sight};
 use sites::Site;
@@ -130,6 +133,8 @@ pub struct Trace<'a> {
     pub poses: Vec<Transform>,
     /// The sites of the best pose.
     pub sites: Vec<Site>,
+    /// The print that two views share of it.
+    pub patches: Vec<Patch>,
 }
 
 /// The object's pose from the edges of one or two pictures, its rotation unknown. Of more pictures the
@@ -165,8 +170,9 @@ pub fn recognise_traced<'a>(
     }
     let result = search.verdict(&different);
     let poses = different.iter().map(|(r, _)| r.pose).collect();
-    let sites = different.into_iter().next().map(|(r, _)| r.sites).unwrap_or_default();
-    Ok((result, Trace { sights, model, poses, sites }))
+    let best = different.into_iter().next().map(|(best, _)| (best.sites, best.patches));
+    let (sites, patches) = best.unwrap_or_default();
+    Ok((result, Trace { sights, model, poses, sites, patches }))
 }
 
 /// Follows an object from picture to picture: the pose near the `last` one, without a search, or

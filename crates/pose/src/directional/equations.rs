@@ -20,6 +20,7 @@ use multiversion::multiversion;
 use nalgebra::{Cholesky, Const, Matrix6, SMatrix, SVector, Vector2, Vector3};
 
 use super::landmark::Landmark;
+use super::print::{PRINT_SD_PX, PRINT_TAIL, Patch, SQUARE_TAIL, SQUARE_WORTH, SURFACE_SD};
 use super::sites::{LIP_AT, SHARED, Site};
 
 /// Unknowns of each view: small turns of its camera.
@@ -49,6 +50,9 @@ const SCATTER_PRIOR: f64 = 1.5;
 pub(super) const OFFSET_TAIL: f64 = 2.0;
 /// The same of what one view sees beside that.
 const VIEW_TAIL: f64 = 3.0;
+
+/// Surfaces are told from other parts by this.
+const SURFACES: u32 = 1 << 20;
 
 /// Changes of the unknowns.
 #[derive(Clone, Default)]
@@ -135,9 +139,6 @@ impl Equations {
         let part = part_of(first.site);
         let seen = offsets.iter().find(|o| o.part == part).copied().unwrap_or_default();
         let scatter = scatter(edges, self.sd_px);
-        // Heavy tails: a part that was seen to be off by much may well be off by much.
-        let tailed =
-            |variance: f64, seen: f64, tail: f64| (tail * variance + seen * seen) / (tail + 1.0);
         let shared = tailed(first.site.offset_sd().powi(2), seen.shared, OFFSET_TAIL);
         let own = |v: usize| {
             let view = VIEW_SD_PX * VIEW_SD_PX + SCATTER_SHARE * SCATTER_SHARE * scatter[v];
@@ -151,6 +152,36 @@ impl Equations {
         });
         let pieces = (self.doubt * PIECE_SD).powi(-2);
         let (rows, rhs) = add_part(&mut self.sums, edges, &scatter, pieces, &priors);
+        self.parts.push(Eliminated { part, rows, rhs });
+    }
+
+    /// Adds the print of one surface, without what only the surface's own place explains. `moved` is how
+    /// far the unknowns are from where its residuals were measured.
+    pub fn surface(&mut self, patches: &[Patch], offsets: &[Offsets], moved: &Move) {
+        let Some(first) = patches.first() else { return };
+        let part = SURFACES | u32::from(first.part);
+        let seen = offsets.iter().find(|o| o.part == part).copied().unwrap_or_default();
+        let doubt = self.doubt * self.doubt;
+        let between = tailed(PRINT_SD_PX * PRINT_SD_PX, seen.own_px[0], PRINT_TAIL);
+        let mut sums = Sums::new();
+        // A surface has no tilt of its own, and what the views differ by is in one place.
+        let priors = [SURFACE_SD * SURFACE_SD, 1.0, between, 1.0];
+        (ALL..).zip(priors).for_each(|(k, variance)| sums.a[k][k] = (doubt * variance).recip());
+        for patch in patches {
+            let mut by = [0.0; PADDED];
+            by.iter_mut().zip(&patch.by_shared).for_each(|(b, j)| *b = *j);
+            for (own, by_turn) in by[SHARED..].chunks_mut(OWN).zip(&patch.by_turn) {
+                own.iter_mut().zip(by_turn.iter()).for_each(|(b, j)| *b = *j);
+            }
+            by[ALL] = patch.by_surface;
+            by[ALL + 2] = 1.0;
+            let residual = patch.left(moved);
+            let left = residual - patch.by_surface * seen.shared - seen.own_px[0];
+            // Heavy tails: gloss, and what stands before the object in one view.
+            let variance = tailed(patch.noise_px * patch.noise_px, left, SQUARE_TAIL);
+            sums.add(SQUARE_WORTH / variance, residual, &by);
+        }
+        let (rows, rhs) = absorb(&mut self.sums, sums);
         self.parts.push(Eliminated { part, rows, rhs });
     }
 
@@ -240,6 +271,12 @@ impl Eliminated {
     }
 }
 
+/// Variance of what has heavy tails, a Student's t of so many degrees of freedom, once it was seen to be
+/// off by so much: by much is less surprising then.
+fn tailed(variance: f64, seen: f64, tail: f64) -> f64 {
+    (tail * variance + seen * seen) / (tail + 1.0)
+}
+
 /// Variance of a part's edges in each view about their mean (px^2).
 fn scatter(edges: &[Edge], sd_px: f64) -> [f64; VIEWS] {
     // Weight, weighted residual and square.
@@ -311,6 +348,13 @@ fn add_part(
         }
         sums.add(-1.0 / (information + precision), moment, &of_piece);
     }
+    absorb(total, sums)
+}
+
+/// Adds a part's sums to those of all unknowns, its own unknowns eliminated: their rows and right-hand
+/// sides.
+#[inline(always)]
+fn absorb(total: &mut Sums, mut sums: Sums) -> ([[f64; PADDED]; PART], [f64; PART]) {
     let (mut rows, mut rhs) = ([[0.0; PADDED]; PART], [0.0; PART]);
     for k in (0..PART).rev() {
         (rows[k], rhs[k]) = sums.eliminate(ALL + k);

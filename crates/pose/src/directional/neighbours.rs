@@ -9,11 +9,14 @@
 //! a mixture: its mean is the estimate, its second moment about that, with the odds taken less
 //! seriously, the covariance. So a pose whose edges are certain gets a small one, and a pose that might
 //! sit on the wrong line of print says so.
+//!
+//! Which top is as far away as the object's surface is, print that both views see can tell ([`print`]).
 
 use nalgebra::{Matrix6, Vector6};
 use vergence_geometry::gaussian::{difference, perturb};
 
 use super::equations::{Move, by_part};
+use super::print;
 use super::refine::{EDGE_SD_PX, FINAL, Pass, Refined, STEPS};
 use super::search::Search;
 use super::sites::Site;
@@ -38,7 +41,8 @@ const PASSES: [Pass; 2] = [FINAL, FINAL];
 const HOPELESS: f64 = 6.0;
 /// What the tops that count in the mean, those less behind than this (nats), are refined by at last: a
 /// site at every pixel. Where sites happen to fall on print and noise no longer matters, and the long
-/// passes before it can do with fewer.
+/// passes before it can do with fewer. Print that both views see has its say only here: it needs a pose
+/// that is right to a pixel or two.
 const POLISH: Pass = Pass::new(EDGE_SD_PX, 4.0, 1.0, true);
 const POLISHED: f64 = 6.0;
 /// A direction is left out when it takes more than this (rad or m) to move the contour that far: a
@@ -168,31 +172,42 @@ fn contour_metric(refined: &Refined) -> Matrix6<f64> {
 }
 
 impl Search<'_> {
-    /// The mean of some optima, best first, by belief, with the second moment about it of all by doubt.
-    fn mixture(&self, mut optima: Vec<(Refined, Explained)>) -> (Refined, Explained) {
-        let explained = optima[0].1;
-        let behind = |e: &Explained| explained.evidence - e.evidence;
-        optima.retain(|o| behind(&o.1) < MOST_BEHIND * DOUBT_NATS);
-        for (refined, _) in optima.iter_mut().filter(|o| behind(&o.1) < POLISHED) {
+    /// The mean of some optima by belief, with the second moment about it of all by doubt.
+    fn mixture(&self, optima: Vec<(Refined, Explained)>) -> (Refined, Explained) {
+        // Which of the tops of the edges is as far away as the surface is, print knows.
+        let all = |(mut r, e): (Refined, Explained)| {
+            r.patches = self.patches(&r);
+            (e.evidence + print::evidence(&r.patches), r, e)
+        };
+        let mut optima: Vec<(f64, Refined, Explained)> = optima.into_iter().map(all).collect();
+        optima.sort_by(|a, b| b.0.total_cmp(&a.0));
+        let most = optima[0].0;
+        optima.retain(|o| most - o.0 < MOST_BEHIND * DOUBT_NATS);
+        for (_, refined, _) in optima.iter_mut().filter(|o| most - o.0 < POLISHED) {
             self.refine(refined, &[POLISH]);
+            // The print was looked for where the contour had the object: where both have it is better.
+            if !refined.patches.is_empty() {
+                refined.patches = self.patches(refined);
+                self.refine(refined, &[POLISH]);
+            }
         }
-        let place = optima[0].0.pose;
+        let place = optima[0].1.pose;
         let (mut mean, mut beliefs) = (Vector6::zeros(), 0.0);
-        for (refined, explained) in &mut optima {
+        for (evidence, refined, _) in &mut optima {
             self.doubt(refined, &FINAL);
-            let belief = (-behind(explained)).exp();
+            let belief = (*evidence - most).exp();
             mean += difference(&place, &refined.pose) * belief;
             beliefs += belief;
         }
         let pose = perturb(&place, &(mean / beliefs));
         let (mut covariance, mut odds) = (Matrix6::zeros(), 0.0);
-        for (refined, explained) in &optima {
-            let doubt = (-behind(explained) / DOUBT_NATS).exp();
+        for (evidence, refined, _) in &optima {
+            let doubt = ((evidence - most) / DOUBT_NATS).exp();
             let d = difference(&pose, &refined.pose);
             covariance += (refined.covariance + d * d.transpose()) * doubt;
             odds += doubt;
         }
-        let top = optima.swap_remove(0).0;
+        let (_, top, explained) = optima.swap_remove(0);
         (Refined { pose, covariance: covariance / odds, ..top }, explained)
     }
 }

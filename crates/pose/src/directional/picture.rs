@@ -1,4 +1,4 @@
-//! What the method saw, as pictures: edges, field, best and second-best pose, residuals.
+//! What the method saw, as pictures: edges, field, best and second-best pose, residuals and print.
 //!
 //! **In:** a [`Trace`]. **Out:** drawings by name, one of each kind a view, over the enlarged part
 //! of the picture that was worked on.
@@ -34,6 +34,10 @@ pub fn draw(trace: &Trace) -> Vec<(String, Canvas)> {
         let mut canvas = Canvas::from_gray(sight.view.image, scale);
         for site in trace.sites.iter().filter(|s| s.view == view) {
             residual(&mut canvas, site, scale);
+        }
+        for patch in trace.patches.iter().filter(|_| view == 0) {
+            let (x, y) = patch.pixel;
+            canvas.circle(enlarged(scale, x, y), 1.0, BLUE);
         }
         out.push((format!("view{view}-5-residuals"), canvas));
     }

@@ -16,6 +16,7 @@ use vergence_geometry::Transform;
 use vergence_geometry::gaussian::{perturb, skew};
 
 use super::equations::{Edge, Equations, Move, Offsets, Solution, VIEWS, by_part, part_of};
+use super::print::Patch;
 use super::search::Search;
 use super::sites::{FORM_AT, Form, LIP_AT, Layout, SHARED, Site, State, sites};
 use crate::model::{Kind, Rest};
@@ -115,6 +116,8 @@ pub struct Refined {
     pub rests: bool,
     /// The sites of the last pass, at the pose before its last step.
     pub sites: Vec<Site>,
+    /// The print that both views see, once [`Search::patches`] has put it there: it counts from then on.
+    pub patches: Vec<Patch>,
 }
 
 type SharedMatrix = SMatrix<f64, SHARED, SHARED>;
@@ -204,6 +207,9 @@ impl Search<'_> {
                 }));
             }
             equations.part(&edges, &refined.offsets);
+        }
+        for part in refined.patches.chunk_by(|a, b| a.part == b.part) {
+            equations.surface(part, &refined.offsets, moved);
         }
         let mut now = refined.without_sites();
         now.apply(moved);
@@ -300,6 +306,7 @@ impl Refined {
             covariance: Matrix6::identity(),
             offsets: Vec::new(),
             sites: Vec::new(),
+            patches: Vec::new(),
         }
     }
 
@@ -307,11 +314,12 @@ impl Refined {
         self.pose = perturb(&self.pose, &moved.shared.fixed_rows::<6>(0).into_owned());
         self.form += moved.shared.fixed_rows::<3>(FORM_AT);
         self.turns.iter_mut().zip(&moved.own).for_each(|(turn, step)| *turn += step);
+        self.patches.iter_mut().for_each(|p| p.residual = p.left(moved));
     }
 
     /// The unknowns alone.
     pub(super) fn without_sites(&self) -> Self {
-        Refined { sites: Vec::new(), offsets: Vec::new(), ..*self }
+        Refined { sites: Vec::new(), offsets: Vec::new(), patches: Vec::new(), ..*self }
     }
 }
 

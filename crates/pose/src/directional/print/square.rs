@@ -1,0 +1,194 @@
+//! Squares of one picture found in the other.
+//!
+//! **In:** a pixel of the first picture, and the [`Place`] where the second should show the square about
+//! it, warped. **Out:** how far along the epipolar line it is from there. Means and slopes of brightness
+//! are taken out of both squares and their contrast is an unknown, so that only print counts.
+
+use nalgebra::{Matrix2, SMatrix, Vector2};
+
+use crate::directional::equations::VIEWS;
+use crate::directional::level::Level;
+
+/// Half the side of a square without its middle, its side and its pixels.
+pub const HALF: usize = 3;
+const SIDE: usize = 2 * HALF + 1;
+const PIXELS: usize = SIDE * SIDE;
+const LANES: usize = 8;
+/// A square needs this many noise deviations of contrast (root mean square).
+const CONTRAST: f32 = 2.0;
+/// Rounds of the shift's refinement, and how far it may go (px): repeated print is further apart.
+const ROUNDS: usize = 4;
+const REACH_PX: f64 = 2.0;
+/// A round that moves by less than this (px) is the last.
+const STILL_PX: f64 = 0.01;
+/// Correlation of the two squares that is needed, on the way and at last, and contrast of the second
+/// against the first.
+const LEAST_CORRELATION: f32 = 0.3;
+const CORRELATION: f32 = 0.8;
+const LEAST_GAIN: f32 = 0.5;
+/// Squares whose shift is known worse than this (px) are left out; none is known better than that.
+const MOST_NOISE_PX: f64 = 0.3;
+const LEAST_NOISE_PX: f64 = 0.07;
+/// Deviation across the epipolar line of where the second picture shows a square (px): lenses.
+const ACROSS_SD_PX: f64 = 0.05;
+
+/// A square on the surface, and where the second view should see it.
+pub struct Place {
+    /// Middle in the first picture's level.
+    pub middle: (usize, usize),
+    /// Middle in the second picture's level, and how it moves there with columns and rows of the first,
+    /// to second order.
+    pub there: Vector2<f64>,
+    pub affine: Matrix2<f64>,
+    pub bend: [Vector2<f64>; 2],
+    /// Unit vector along the epipolar line in the second picture.
+    pub epipolar: Vector2<f64>,
+    /// How it moves in the second picture with small turns of each camera about its own x and y axes (px
+    /// per rad).
+    pub by_turn: [Matrix2<f64>; VIEWS],
+}
+
+/// Where a square was found.
+pub struct Found {
+    /// How far along the epipolar line from its place (px), and the deviation of that.
+    pub shift: f64,
+    /// See `shift`.
+    pub noise_px: f64,
+    /// How much longer or shorter the shift seems by a displacement in the second picture: as much as it
+    /// is along the line, and by what is across it, the more the more level the print's edges are to the
+    /// line.
+    pub along: Vector2<f64>,
+}
+
+/// Grey levels of a square: a row of the picture in every column, padded with zeros to a whole vector.
+pub type Square = SMatrix<f32, LANES, SIDE>;
+
+/// The square about a pixel that is far enough from the border, without its mean and its slopes; `None`
+/// where there is little to see.
+pub fn print_at(level: &Level, x: usize, y: usize) -> Option<Square> {
+    let flat = flattened(&square(level, x, y));
+    let least = CONTRAST * level.step_noise * (PIXELS as f32).sqrt();
+    (flat.norm() >= least).then_some(flat)
+}
+
+/// The grey levels around a pixel that is far enough from the border.
+fn square(level: &Level, x: usize, y: usize) -> Square {
+    let mut out = Square::zeros();
+    for (row, mut to) in (y - HALF..).zip(out.column_iter_mut()) {
+        let from = &level.smooth.row(row)[x - HALF..][..SIDE];
+        to.iter_mut().zip(from).for_each(|(to, from)| *to = *from);
+    }
+    out
+}
+
+/// Where a square's pixel is from its middle, by lane.
+const AT: [f32; LANES] = {
+    let mut at = [0.0; LANES];
+    let mut k = 0;
+    while k < SIDE {
+        at[k] = k as f32 - HALF as f32;
+        k += 1;
+    }
+    at
+};
+
+/// Without its mean and its slopes.
+fn flattened(square: &Square) -> Square {
+    // Sum of k^2 over all pixels.
+    const SQUARES: f32 = (SIDE * HALF * (HALF + 1) * SIDE / 3) as f32;
+    let (mut columns, mut by_y) = ([0.0; LANES], [0.0; LANES]);
+    for (row, y) in square.column_iter().zip(AT) {
+        for k in 0..LANES {
+            columns[k] += row[k];
+            by_y[k] += y * row[k];
+        }
+    }
+    let mean = columns.iter().sum::<f32>() / PIXELS as f32;
+    let by_x = columns.iter().zip(AT).map(|(v, x)| v * x).sum::<f32>() / SQUARES;
+    let by_y = by_y.iter().sum::<f32>() / SQUARES;
+    let mut out = *square;
+    for (mut row, y) in out.column_iter_mut().zip(AT) {
+        for k in 0..SIDE {
+            row[k] -= mean + by_x * AT[k] + by_y * y;
+        }
+    }
+    out
+}
+
+/// Where the second picture shows a square: Gauss-Newton on shift and contrast, the slopes being the first
+/// picture's.
+pub fn find(here: &Square, first: &Level, second: &Level, place: &Place) -> Option<Found> {
+    // A step in the second picture is this step in the first.
+    let back = place.affine.try_inverse()?;
+    let (x, y) = place.middle;
+    let between = |dx: usize, dy: usize| {
+        let [before, after] = [square(first, x - dx, y - dy), square(first, x + dx, y + dy)];
+        (after - before) * 0.5
+    };
+    let slopes = [between(1, 0), between(0, 1)];
+    let along =
+        |step: Vector2<f64>| flattened(&(slopes[0] * step.x as f32 + slopes[1] * step.y as f32));
+    let across = Vector2::new(-place.epipolar.y, place.epipolar.x);
+    let (slopes, level) = (along(back * place.epipolar), along(back * across));
+    let (hh, hs, ss) = (here.norm_squared(), here.dot(&slopes), slopes.norm_squared());
+    let determinant = hh * ss - hs * hs;
+    if determinant <= 1e-6 * hh * ss {
+        return None;
+    }
+    let (mut shift, mut found) = (0.0, None);
+    for _ in 0..ROUNDS {
+        let there = flattened(&warped(second, place, shift)?);
+        let (ht, st, tt) = (here.dot(&there), slopes.dot(&there), there.norm_squared());
+        // there = gain here - moved slopes.
+        let gain = (ht * ss - st * hs) / determinant;
+        let moved = (ht * hs - st * hh) / determinant;
+        let correlation = ht / (hh * tt).sqrt();
+        if gain < LEAST_GAIN || gain > LEAST_GAIN.recip() || correlation < LEAST_CORRELATION {
+            return None;
+        }
+        let change = f64::from(moved / gain);
+        shift += change.clamp(-1.0, 1.0);
+        if shift.abs() > REACH_PX {
+            return None;
+        }
+        let rest = (tt - gain * ht + moved * st).max(0.0) / (PIXELS - 5) as f32;
+        let noise_px = f64::from((rest * hh / determinant).sqrt() / gain);
+        found = Some((correlation, noise_px));
+        if change.abs() < STILL_PX {
+            break;
+        }
+    }
+    let (correlation, noise_px) = found?;
+    let slant = f64::from(level.dot(&slopes) / ss);
+    let noise_px = noise_px.hypot(slant * ACROSS_SD_PX).max(LEAST_NOISE_PX);
+    let along = place.epipolar + across * slant;
+    let found = Found { shift, noise_px, along };
+    (correlation > CORRELATION && noise_px < MOST_NOISE_PX).then_some(found)
+}
+
+/// The second picture where the square's pixels are in it, shifted along the epipolar line; `None` when
+/// some are outside.
+fn warped(level: &Level, place: &Place, shift: f64) -> Option<Square> {
+    let (width, height) = (level.width(), level.height());
+    let data = level.smooth.data();
+    let middle = (place.there + place.epipolar * shift).cast::<f32>();
+    let mut out = Square::zeros();
+    let (affine, bend) = (place.affine.cast::<f32>(), place.bend.map(|b| b.cast::<f32>()));
+    let (most_x, most_y) = (width as f32 - 1.0, height as f32 - 1.0);
+    for (mut row, y) in out.column_iter_mut().zip(AT) {
+        let start = affine.column(1) * y + bend[1] * (y * y) + middle;
+        for (value, x) in row.iter_mut().zip(AT).take(SIDE) {
+            let at = start + affine.column(0) * x + bend[0] * (x * x);
+            if !(at.x >= 0.0 && at.y >= 0.0 && at.x < most_x && at.y < most_y) {
+                return None;
+            }
+            let (column, row) = (at.x as usize, at.y as usize);
+            let (right, down) = (at.x - column as f32, at.y - row as f32);
+            let i = row * width + column;
+            let along = |i: usize| data[i] + right * (data[i + 1] - data[i]);
+            let (above, below) = (along(i), along(i + width));
+            *value = above + down * (below - above);
+        }
+    }
+    Some(out)
+}

@@ -1,0 +1,253 @@
+//! Two pictures of a printed body, drawn by rays, against what print should say about its pose.
+
+use std::f64::consts::FRAC_PI_2;
+
+use nalgebra::{Matrix3, Point2, UnitQuaternion, Vector6};
+use vergence_geometry::gaussian::perturb;
+use vergence_geometry::{Camera, GaussianPoint};
+use vergence_imaging::Image;
+use vergence_tag::Record;
+
+use super::*;
+use crate::directional::equations::Move;
+use crate::directional::refine::{FINAL, STEPS};
+use crate::directional::{Config, prepare};
+use crate::model::Model;
+use crate::types::{Query, View};
+
+const BODIES: [&str; 4] = [
+    r#""bounding_box": {"width": 0.14, "length": 0.12, "height": 0.18}, "shape": {"kind": "box"}"#,
+    r#""bounding_box": {"width": 0.1, "length": 0.1, "height": 0.16},
+        "shape": {"kind": "cylinder", "diameter": 0.1, "height": 0.16}"#,
+    r#""bounding_box": {"width": 0.12, "length": 0.12, "height": 0.16},
+        "shape": {"kind": "cup", "top_diameter": 0.12, "bottom_diameter": 0.09, "height": 0.16}"#,
+    r#""bounding_box": {"width": 0.14, "length": 0.14, "height": 0.14},
+        "shape": {"kind": "sphere", "diameter": 0.14}"#,
+];
+
+/// A body whose landmark is below, where no camera sees it.
+fn record(body: &str) -> Record {
+    let text = format!(
+        r#"{{"object_id": "printed", "landmarks": [{{"position": [0, 0, -0.06], "normal": [0, 0, -1]}}], {body}}}"#
+    );
+    serde_json::from_str(&text).unwrap()
+}
+
+/// Two cameras beside each other that look at the body's place from a little above.
+fn cameras() -> [(Camera, Transform); 2] {
+    [0.1, -0.1].map(|y| {
+        let turn = UnitQuaternion::from_euler_angles(-1.9, 0.0, -FRAC_PI_2 - 1.4 * y);
+        let place = Vector3::new(0.0, y, 0.3);
+        (Camera::centred(320, 240, 380.0), Transform::from_parts(place.into(), turn))
+    })
+}
+
+/// `base_from_object`, turned so that a box shows three faces.
+fn pose() -> Transform {
+    let turn = UnitQuaternion::from_euler_angles(0.0, 0.0, 0.5);
+    Transform::from_parts(Vector3::new(0.75, 0.01, 0.05).into(), turn)
+}
+
+/// Print everywhere on the surface, under a lamp at one side; the background is dark.
+fn picture(model: &Model, (camera, base_from_optical): &(Camera, Transform)) -> Image<u8> {
+    let object_from_optical = pose().inverse() * base_from_optical;
+    let eye = object_from_optical.translation.vector;
+    let lamp = Vector3::new(-0.6, 0.5, 0.6).normalize();
+    const RAYS: usize = 4;
+    let level = |x: f64, y: f64| {
+        let ray = object_from_optical.rotation * camera.unproject(&Point2::new(x, y));
+        let Some(hit) = model.first_hit(&eye, &ray) else { return 20.0 };
+        let p = (eye + ray * hit.distance) * 1e3;
+        let print = (p.x / 4.1).sin() * (p.y / 3.3 + 0.4).sin() + (p.z / 3.7 + p.x / 6.1).sin();
+        (110.0 + 35.0 * print) * (0.5 + 0.5 * hit.normal.dot(&lamp).max(0.0))
+    };
+    Image::from_fn(camera.width, camera.height, |x, y| {
+        let part = |k: usize| (k as f64 + 0.5) / RAYS as f64 - 0.5;
+        let rays = (0..RAYS * RAYS).map(|k| (part(k % RAYS), part(k / RAYS)));
+        let sum: f64 = rays.map(|(dx, dy)| level(x as f64 + dx, y as f64 + dy)).sum();
+        (sum / (RAYS * RAYS) as f64).round() as u8
+    })
+}
+
+/// The landmark is measured this much too far away (m).
+const TOO_FAR: Vector3<f64> = Vector3::new(0.003, 0.0, 0.0);
+
+/// Calls back with a search on the pictures of a body.
+fn with(body: &str, check: impl Fn(&Search)) {
+    with_turned(body, Default::default(), check);
+}
+
+/// The same when the cameras were turned a little more than told.
+fn with_turned(body: &str, turns: [Vector2<f64>; 2], check: impl Fn(&Search)) {
+    let record = record(body);
+    let model = Model::new(&record);
+    let cameras = cameras();
+    let images = [0, 1].map(|v| {
+        let turned = Transform::rotation(turns[v].push(0.0));
+        picture(&model, &(cameras[v].0, cameras[v].1 * turned.inverse()))
+    });
+    let views = [0, 1].map(|v| View {
+        image: &images[v],
+        camera: cameras[v].0,
+        base_from_optical: cameras[v].1,
+        turn_sd: 1e-3,
+    });
+    let on_body = Vector3::new(0.0, 0.0, -0.06);
+    let landmark = GaussianPoint {
+        position: pose() * Point3::from(on_body) + TOO_FAR,
+        covariance: Matrix3::identity() * 1e-5,
+    };
+    let (up, standing) = (Some(Vector3::z_axis()), Some(true));
+    let query = Query { record: &record, landmark, landmark_index: 0, up, standing };
+    let config = Config::default();
+    let sights = prepare(&views, &query, on_body, &config, false);
+    let search = Search::new(&sights, &model, &query, (on_body, -Vector3::z()), &config);
+    check(&search);
+}
+
+/// The squares in a pose that is off the true one by this tangent.
+fn seen(search: &Search, off: &Vector6<f64>) -> Vec<Patch> {
+    let mut refined = Refined::new(&perturb(&pose(), off), false);
+    search.lay_out(&mut refined, &FINAL.layout);
+    search.patches(&refined)
+}
+
+fn mean(patches: &[Patch], of: impl Fn(&Patch) -> f64) -> f64 {
+    patches.iter().map(of).sum::<f64>() / patches.len() as f64
+}
+
+#[test]
+fn print_is_where_the_true_pose_puts_it_on_flat_and_on_curved_surfaces() {
+    for body in BODIES {
+        with(body, |search| {
+            let patches = seen(search, &Vector6::zeros());
+            assert!(patches.len() > 100, "{} squares of {body}", patches.len());
+            for surface in patches.chunk_by(|a, b| a.part == b.part) {
+                // A hundredth of a pixel is a tenth of a millimetre here.
+                let off = mean(surface, |p| p.residual);
+                let what = format!("{off:.3} px, {} squares of {body}", surface.len());
+                assert!(surface.len() < 20 || off.abs() < 0.02, "{what}");
+            }
+        });
+    }
+}
+
+#[test]
+fn print_says_how_far_a_pose_is_off() {
+    // Turned by 0.2 deg about the base's axes, moved by up to 2 mm.
+    let off = Vector6::new(0.003, -0.003, 0.003, 0.002, 0.001, -0.001);
+    for body in BODIES {
+        with(body, |search| {
+            let patches = seen(search, &off);
+            assert!(patches.len() > 100, "{} squares of {body}", patches.len());
+            let predicted = |p: &Patch| -(p.by_shared.fixed_columns::<6>(0) * off).x;
+            let left = mean(&patches, |p| (p.residual - predicted(p)).abs());
+            let moved = mean(&patches, |p| predicted(p).abs());
+            assert!(moved > 0.2 && left < 0.2 * moved, "{left:.3} of {moved:.3} px, {body}");
+        });
+    }
+}
+
+#[test]
+fn print_alone_brings_surfaces_back() {
+    for body in BODIES {
+        with(body, |search| {
+            let off = Vector6::new(0.0, 0.0, 0.0, TOO_FAR.x, TOO_FAR.y, TOO_FAR.z);
+            let mut refined = Refined::new(&perturb(&pose(), &off), false);
+            let mut shifts = Vec::new();
+            for _ in 0..3 {
+                search.lay_out(&mut refined, &FINAL.layout);
+                refined.patches = search.patches(&refined);
+                shifts.push(mean(&refined.patches, |p| p.residual.abs()));
+                let mut moved = Move::default();
+                (0..STEPS).for_each(|_| search.advance(&mut refined, &[], 0.2, &mut moved));
+                refined.apply(&moved);
+            }
+            assert!(shifts[0] > 0.2 && shifts[2] < 0.25 * shifts[0], "{shifts:?} px, {body}");
+        });
+    }
+}
+
+#[test]
+fn the_second_view_sees_a_point_move_by_the_derivatives() {
+    for body in BODIES {
+        with(body, |search| {
+            let [first, second] = search.sights else { panic!("two views") };
+            let level = &first.fine;
+            let at = |refined: &Refined, x: usize, y: usize| {
+                let pair = Pair::new(search, refined, [first, second]);
+                pair.carry_over(x, y, pair.surface(pixel_of(level, x, y))?)
+            };
+            let still = Refined::new(&pose(), false);
+            let mut checked = 0;
+            let spread = |k: usize, size: usize| size / 3 + k * size / 30;
+            let (width, height) = (level.width(), level.height());
+            for (x, y) in (0..100).map(|k| (spread(k % 10, width), spread(k / 10, height))) {
+                let Some((place, patch)) = at(&still, x, y) else { continue };
+                const STEP: f64 = 1e-5;
+                let derivative = |change: &dyn Fn(&mut Refined)| {
+                    let mut moved = still.clone();
+                    change(&mut moved);
+                    let (there, _) = at(&moved, x, y)?;
+                    Some((there.there - place.there).dot(&place.epipolar) / STEP)
+                };
+                let by_pose = (0..6).map(|k| {
+                    let tangent = Vector6::ith(k, STEP);
+                    let by = derivative(&|r| r.pose = perturb(&r.pose, &tangent));
+                    (by, patch.by_shared[k])
+                });
+                let by_turn = (0..4).map(|k| {
+                    let by = derivative(&|r| r.turns[k / 2][k % 2] = STEP);
+                    (by, place.epipolar.dot(&place.by_turn[k / 2].column(k % 2)))
+                });
+                let by_size = (derivative(&|r| r.form.x = STEP), patch.by_shared[FORM_AT]);
+                for (k, (by, told)) in by_pose.chain(by_turn).chain([by_size]).enumerate() {
+                    let Some(by) = by else { continue };
+                    let close = (by - told).abs() < 0.01 * told.abs() + 0.5;
+                    assert!(close, "unknown {k} at ({x}, {y}): {by:.2}, told {told:.2}, {body}");
+                    checked += 1;
+                }
+            }
+            assert!(checked > 100, "{checked} of {body}");
+        });
+    }
+}
+
+#[test]
+fn cameras_that_are_turned_shift_print_as_the_derivatives_say() {
+    // Up to a fifth of a pixel, along and across the epipolar line.
+    let turns = [Vector2::new(3e-4, -2e-4), Vector2::new(-2e-4, 3e-4)];
+    for body in BODIES {
+        with_turned(body, turns, |search| {
+            let patches = seen(search, &Vector6::zeros());
+            let predicted = |p: &Patch| {
+                p.by_turn.iter().zip(&turns).map(|(by, turn)| (by * turn).x).sum::<f64>()
+            };
+            let left = mean(&patches, |p| (p.residual - predicted(p)).abs());
+            let moved = mean(&patches, |p| predicted(p).abs());
+            assert!(moved > 0.1 && left < 0.25 * moved, "{left:.3} of {moved:.3} px, {body}");
+        });
+    }
+}
+
+#[test]
+fn what_is_far_off_and_what_is_little_says_nothing() {
+    let patch = Patch {
+        pixel: (0.0, 0.0),
+        part: 0,
+        residual: 0.0,
+        noise_px: 0.1,
+        by_surface: 100.0,
+        by_shared: ByShared::zeros(),
+        by_turn: Default::default(),
+    };
+    let squares = |n: usize, residual: f64| vec![Patch { residual, ..patch.clone() }; n];
+    assert_eq!(evidence(&[]), 0.0);
+    assert_eq!(evidence(&squares(4, 1.5)), 0.0);
+    assert!(evidence(&squares(40, 0.0)) > evidence(&squares(10, 0.0)));
+    assert!(evidence(&squares(40, 0.0)) > evidence(&squares(40, 0.3)));
+    // A second surface that is right adds to the first.
+    let mut two = squares(10, 0.0);
+    two.extend(squares(10, 0.0).into_iter().map(|p| Patch { part: 1, ..p }));
+    assert!((evidence(&two) - 2.0 * evidence(&squares(10, 0.0))).abs() < 1e-9);
+}
