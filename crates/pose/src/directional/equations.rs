@@ -1,6 +1,6 @@
 //! Normal equations of the refinement, with errors that sites have in common.
 //!
-//! **In:** weighted residuals of contour sites with their derivatives, and priors. **Out:** the
+//! **In:** weighted residuals of contour sites and of print with their derivatives, and priors. **Out:** the
 //! step of all unknowns and the pose's covariance.
 //!
 //! Sites along one edge do not err independently. A rounded or bent edge, a shadow, a lamp on one
@@ -17,11 +17,11 @@
 //! where a shadow or another object ends beside it).
 
 use multiversion::multiversion;
-use nalgebra::{Cholesky, Const, Matrix6, SMatrix, SVector, Vector2, Vector3};
+use nalgebra::{Cholesky, Const, Matrix6, RowVector2, SMatrix, SVector, Vector2, Vector3};
 
 use super::landmark::Landmark;
 use super::print::{PRINT_SD_PX, PRINT_TAIL, Patch, SQUARE_TAIL, SQUARE_WORTH, SURFACE_SD};
-use super::sites::{LIP_AT, SHARED, Site};
+use super::sites::{ByShared, LIP_AT, SHARED, Site};
 
 /// Unknowns of each view: small turns of its camera.
 const OWN: usize = 2;
@@ -137,7 +137,7 @@ impl Equations {
     pub fn part(&mut self, edges: &[Edge], offsets: &[Offsets]) {
         let Some(first) = edges.first() else { return };
         let part = part_of(first.site);
-        let seen = offsets.iter().find(|o| o.part == part).copied().unwrap_or_default();
+        let seen = seen(offsets, part);
         let scatter = scatter(edges, self.sd_px);
         let shared = tailed(first.site.offset_sd().powi(2), seen.shared, OFFSET_TAIL);
         let own = |v: usize| {
@@ -160,7 +160,7 @@ impl Equations {
     pub fn surface(&mut self, patches: &[Patch], offsets: &[Offsets], moved: &Move) {
         let Some(first) = patches.first() else { return };
         let part = SURFACES | u32::from(first.part);
-        let seen = offsets.iter().find(|o| o.part == part).copied().unwrap_or_default();
+        let seen = seen(offsets, part);
         let doubt = self.doubt * self.doubt;
         let between = tailed(PRINT_SD_PX * PRINT_SD_PX, seen.own_px[0], PRINT_TAIL);
         let mut sums = Sums::new();
@@ -168,11 +168,7 @@ impl Equations {
         let priors = [SURFACE_SD * SURFACE_SD, 1.0, between, 1.0];
         (ALL..).zip(priors).for_each(|(k, variance)| sums.a[k][k] = (doubt * variance).recip());
         for patch in patches {
-            let mut by = [0.0; PADDED];
-            by.iter_mut().zip(&patch.by_shared).for_each(|(b, j)| *b = *j);
-            for (own, by_turn) in by[SHARED..].chunks_mut(OWN).zip(&patch.by_turn) {
-                own.iter_mut().zip(by_turn.iter()).for_each(|(b, j)| *b = *j);
-            }
+            let mut by = by_all(&patch.by_shared, &patch.by_turn);
             by[ALL] = patch.by_surface;
             by[ALL + 2] = 1.0;
             let residual = patch.left(moved);
@@ -213,11 +209,8 @@ impl Equations {
         let (residual, by_shared) = (measured.whiten * residual, measured.whiten * by_shared);
         let by_turn = measured.by_turn.map(|by_turn| measured.whiten * by_turn);
         for k in 0..3 {
-            let mut by = [0.0; PADDED];
-            by.iter_mut().zip(&by_shared.row(k)).for_each(|(b, j)| *b = *j);
-            for (own, by_turn) in by[SHARED..].chunks_mut(OWN).zip(&by_turn) {
-                own.iter_mut().zip(&by_turn.row(k)).for_each(|(b, j)| *b = *j);
-            }
+            let by_turn = by_turn.map(|by_turn| by_turn.row(k).into_owned());
+            let by = by_all(&by_shared.row(k).into_owned(), &by_turn);
             self.sums.add(1.0, residual[k], &by);
         }
     }
@@ -269,6 +262,21 @@ impl Eliminated {
         let own_px = std::array::from_fn(|v| known[ALL + 2 + v]);
         Offsets { part: self.part, shared: known[ALL], own_px }
     }
+}
+
+/// Derivatives by all unknowns, of a measurement in which both views have a part.
+fn by_all(by_shared: &ByShared, by_turn: &[RowVector2<f64>; VIEWS]) -> [f64; PADDED] {
+    let mut by = [0.0; PADDED];
+    by.iter_mut().zip(by_shared).for_each(|(b, j)| *b = *j);
+    for (own, by_turn) in by[SHARED..].chunks_mut(OWN).zip(by_turn) {
+        own.iter_mut().zip(by_turn).for_each(|(b, j)| *b = *j);
+    }
+    by
+}
+
+/// A part's offsets as last seen.
+fn seen(offsets: &[Offsets], part: u32) -> Offsets {
+    offsets.iter().find(|o| o.part == part).copied().unwrap_or_default()
 }
 
 /// Variance of what has heavy tails, a Student's t of so many degrees of freedom, once it was seen to be

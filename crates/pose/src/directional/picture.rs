@@ -35,9 +35,10 @@ pub fn draw(trace: &Trace) -> Vec<(String, Canvas)> {
         for site in trace.sites.iter().filter(|s| s.view == view) {
             residual(&mut canvas, site, scale);
         }
-        for patch in trace.patches.iter().filter(|_| view == 0) {
-            let (x, y) = patch.pixel;
-            canvas.circle(enlarged(scale, x, y), 1.0, BLUE);
+        // Squares of print have their places in the first view.
+        let squares = if view == 0 { &trace.patches[..] } else { &[] };
+        for at in squares.iter().map(|patch| patch.pixel) {
+            canvas.circle(enlarged(scale, at.x, at.y), 1.0, BLUE);
         }
         out.push((format!("view{view}-5-residuals"), canvas));
     }

@@ -17,7 +17,7 @@ mod tests;
 
 use std::ops::Range;
 
-use nalgebra::{Isometry3, Matrix2, Point3, RowVector2, Vector2, Vector3};
+use nalgebra::{Matrix2, Point2, Point3, RowVector2, Vector2, Vector3};
 use vergence_geometry::Transform;
 
 use super::equations::{Move, VIEWS};
@@ -54,7 +54,7 @@ const LEAST_SQUARES: usize = 4;
 #[derive(Debug, Clone, PartialEq)]
 pub struct Patch {
     /// Its middle in the first picture.
-    pub pixel: (f64, f64),
+    pub pixel: Point2<f64>,
     /// Which surface of the object it is on.
     pub part: u16,
     /// How far along the epipolar line of the second view it is from where the pose puts it (px).
@@ -69,8 +69,16 @@ pub struct Patch {
     pub by_turn: [RowVector2<f64>; VIEWS],
 }
 
-/// A point of the surface (object frame), the surface's number and its normal there.
-type Seen = (Vector3<f64>, u16, Vector3<f64>);
+/// A point of the object that the first view sees.
+#[derive(Clone, Copy)]
+struct Seen {
+    /// Where it is (object frame).
+    p: Vector3<f64>,
+    /// The surface's number.
+    part: u16,
+    /// Its outward unit normal there (object frame).
+    normal: Vector3<f64>,
+}
 
 impl Patch {
     /// What is left of the residual (px) when the unknowns have moved.
@@ -93,19 +101,22 @@ impl Search<'_> {
             for x in columns.clone().step_by(step) {
                 let Some(middle) = pair.surface(pixel_of(level, x, y)) else { continue };
                 let Some(here) = print_at(level, x, y) else { continue };
-                let Some((place, patch)) = pair.carry_over(x, y, middle) else { continue };
+                let Some((place, by_surface)) = pair.carry_over(x, y, middle) else { continue };
                 let Some(found) = find(&here, level, &second.fine, &place) else { continue };
                 out.push(Patch {
+                    pixel: pixel_of(level, x, y).into(),
+                    part: middle.part,
                     residual: found.shift,
                     noise_px: found.noise_px,
+                    by_surface,
+                    by_shared: pair.by_shared(&middle) * by_surface,
                     by_turn: place.by_turn.map(|by| found.along.transpose() * by),
-                    ..patch
                 });
             }
         }
         out.sort_by_key(|p: &Patch| p.part);
-        let few = |s: &[Patch]| s.len() < LEAST_SQUARES;
-        out.chunk_by(|a, b| a.part == b.part).filter(|s| !few(s)).flatten().cloned().collect()
+        let surfaces = out.chunk_by(|a, b| a.part == b.part);
+        surfaces.filter(|squares| squares.len() >= LEAST_SQUARES).flatten().cloned().collect()
     }
 }
 
@@ -151,8 +162,7 @@ impl<'a> Pair<'a> {
             let turned = Transform::rotation(refined.turns[v].push(0.0));
             turned * sights[v].optical_from_base * refined.pose
         });
-        let [object_from_first, object_from_second] =
-            from_object.map(|t: Isometry3<f64>| t.inverse());
+        let [object_from_first, object_from_second] = from_object.map(|t: Transform| t.inverse());
         let eyes = [object_from_first, object_from_second].map(|t| t.translation.vector);
         let (pose, size) = (refined.pose, refined.form.x.exp());
         let camera = &sights[0].view.camera;
@@ -165,19 +175,21 @@ impl<'a> Pair<'a> {
         Pair { search, sights, pose, size, from_object, object_from_first, eyes, tags }
     }
 
-    /// The point (object frame) of the surface that a pixel of the first picture shows, with the
-    /// surface's number and normal.
+    /// The point that a pixel of the first picture shows.
     fn surface(&self, pixel: Vector2<f64>) -> Option<Seen> {
         let ray =
             self.object_from_first.rotation * self.sights[0].view.camera.unproject(&pixel.into());
         let eye = self.eyes[0] / self.size;
         let hit = self.search.model.first_hit(&eye, &ray)?;
         let seen = hit.normal.dot(&ray) < -FACING;
-        seen.then_some(((eye + ray * hit.distance) * self.size, hit.part, hit.normal))
+        let p = (eye + ray * hit.distance) * self.size;
+        seen.then_some(Seen { p, part: hit.part, normal: hit.normal })
     }
 
-    /// Where the square about a pixel of the first level is in the second, and how it moves.
-    fn carry_over(&self, x: usize, y: usize, (p, part, normal): Seen) -> Option<(Place, Patch)> {
+    /// Where the square about a pixel of the first level is in the second, and its shift along the epipolar
+    /// line by the surface along its own normal (px per m).
+    fn carry_over(&self, x: usize, y: usize, seen: Seen) -> Option<(Place, f64)> {
+        let Seen { p, part, normal } = seen;
         let [first, second] = self.sights;
         let pixel = pixel_of(&first.fine, x, y);
         let to_second = (self.eyes[1] - p).normalize();
@@ -186,17 +198,17 @@ impl<'a> Pair<'a> {
         }
         let half = HALF as f64;
         let corner = half + MARGIN_PX;
-        for (dx, dy) in [(-corner, -corner), (corner, -corner), (corner, corner), (-corner, corner)]
-        {
-            if self.surface(pixel + Vector2::new(dx, dy))?.1 != part {
-                return None;
-            }
-        }
         let beside_tag = |(tag, radius): &(Vector2<f64>, f64)| {
             (tag - pixel).map(|d| (d.abs() - half).max(0.0)).norm() < *radius
         };
         if self.tags.iter().any(beside_tag) {
             return None;
+        }
+        for (dx, dy) in [(-corner, -corner), (corner, -corner), (corner, corner), (-corner, corner)]
+        {
+            if self.surface(pixel + Vector2::new(dx, dy))?.part != part {
+                return None;
+            }
         }
         let project = |p: &Vector3<f64>| {
             let q = self.from_object[1] * Point3::from(*p);
@@ -204,7 +216,7 @@ impl<'a> Pair<'a> {
         };
         let (there, q, by_point) = project(&p)?;
         let beside =
-            |dx: f64, dy: f64| Some(project(&self.surface(pixel + Vector2::new(dx, dy))?.0)?.0);
+            |dx: f64, dy: f64| Some(project(&self.surface(pixel + Vector2::new(dx, dy))?.p)?.0);
         let [left, right] = [beside(-half, 0.0)?, beside(half, 0.0)?];
         let [above, below] = [beside(0.0, -half)?, beside(0.0, half)?];
         let slope = |a: Vector2<f64>, b: Vector2<f64>| (b - a) / (2.0 * half);
@@ -239,15 +251,17 @@ impl<'a> Pair<'a> {
                 Matrix2::from_columns(&[Vector3::x(), Vector3::y()].map(by_second)),
             ],
         };
-        let (lever, out) = (self.pose.rotation * p, self.pose.rotation * normal);
+        Some((place, by_surface))
+    }
+
+    /// How far a point moves along its surface's normal (m) by the shared unknowns.
+    fn by_shared(&self, at: &Seen) -> ByShared {
+        let (lever, out) = (self.pose.rotation * at.p, self.pose.rotation * at.normal);
         let mut by_shared = ByShared::zeros();
         by_shared.fixed_columns_mut::<3>(0).copy_from(&lever.cross(&out).transpose());
         by_shared.fixed_columns_mut::<3>(3).copy_from(&out.transpose());
         by_shared[FORM_AT] = out.dot(&lever);
-        by_shared *= by_surface;
-        let pixel = (pixel.x, pixel.y);
-        let (residual, noise_px, by_turn) = (0.0, 0.0, Default::default());
-        Some((place, Patch { pixel, part, residual, noise_px, by_surface, by_shared, by_turn }))
+        by_shared
     }
 }
 

@@ -1,4 +1,4 @@
-//! All six unknowns together, from the edges of all views, the landmark and gravity.
+//! All six unknowns together, from the edges of all views, print that both see, the landmark and gravity.
 //!
 //! **In:** a pose that is right to a few pixels. **Out:** the pose that maximises the likelihood of
 //! a mixture: every site's edge is one of its candidates with Gaussian error, or none. Solved by

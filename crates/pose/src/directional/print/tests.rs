@@ -2,7 +2,7 @@
 
 use std::f64::consts::FRAC_PI_2;
 
-use nalgebra::{Matrix3, Point2, UnitQuaternion, Vector6};
+use nalgebra::{Matrix3, UnitQuaternion, Vector6};
 use vergence_geometry::gaussian::perturb;
 use vergence_geometry::{Camera, GaussianPoint};
 use vergence_imaging::Image;
@@ -176,14 +176,16 @@ fn the_second_view_sees_a_point_move_by_the_derivatives() {
             let level = &first.fine;
             let at = |refined: &Refined, x: usize, y: usize| {
                 let pair = Pair::new(search, refined, [first, second]);
-                pair.carry_over(x, y, pair.surface(pixel_of(level, x, y))?)
+                let middle = pair.surface(pixel_of(level, x, y))?;
+                let (place, by_surface) = pair.carry_over(x, y, middle)?;
+                Some((place, pair.by_shared(&middle) * by_surface))
             };
             let still = Refined::new(&pose(), false);
             let mut checked = 0;
             let spread = |k: usize, size: usize| size / 3 + k * size / 30;
             let (width, height) = (level.width(), level.height());
             for (x, y) in (0..100).map(|k| (spread(k % 10, width), spread(k / 10, height))) {
-                let Some((place, patch)) = at(&still, x, y) else { continue };
+                let Some((place, by_shared)) = at(&still, x, y) else { continue };
                 const STEP: f64 = 1e-5;
                 let derivative = |change: &dyn Fn(&mut Refined)| {
                     let mut moved = still.clone();
@@ -194,13 +196,13 @@ fn the_second_view_sees_a_point_move_by_the_derivatives() {
                 let by_pose = (0..6).map(|k| {
                     let tangent = Vector6::ith(k, STEP);
                     let by = derivative(&|r| r.pose = perturb(&r.pose, &tangent));
-                    (by, patch.by_shared[k])
+                    (by, by_shared[k])
                 });
                 let by_turn = (0..4).map(|k| {
                     let by = derivative(&|r| r.turns[k / 2][k % 2] = STEP);
                     (by, place.epipolar.dot(&place.by_turn[k / 2].column(k % 2)))
                 });
-                let by_size = (derivative(&|r| r.form.x = STEP), patch.by_shared[FORM_AT]);
+                let by_size = (derivative(&|r| r.form.x = STEP), by_shared[FORM_AT]);
                 for (k, (by, told)) in by_pose.chain(by_turn).chain([by_size]).enumerate() {
                     let Some(by) = by else { continue };
                     let close = (by - told).abs() < 0.01 * told.abs() + 0.5;
@@ -233,7 +235,7 @@ fn cameras_that_are_turned_shift_print_as_the_derivatives_say() {
 #[test]
 fn what_is_far_off_and_what_is_little_says_nothing() {
     let patch = Patch {
-        pixel: (0.0, 0.0),
+        pixel: Point2::origin(),
         part: 0,
         residual: 0.0,
         noise_px: 0.1,
