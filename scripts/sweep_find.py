@@ -3,10 +3,14 @@
 Usage: python sweep_find.py [--program target/release/vergence] [--seeds 12] [--jobs 2]
 
 Each line: one change in workcell.toml, every object of the workcell found at that many seeds; how many are
-found, how many of these lie within 10 mm of the simulator's truth, and their median and 90 % error.
+found, how many of these lie within 10 mm of the simulator's truth, of how many the 95 % ellipsoid of the
+position holds the truth, and their median and 90 % error.
 """
 import argparse, concurrent.futures, json, math, os, subprocess, tempfile
 
+SERVOS = 'servos = { driver = "sim" }'
+# What the configuration says of the zeros of either head.
+TOLD = [(f"{SERVOS}\n\n[{after}]", f"{SERVOS}\nzero_sd_deg = 0.3\n\n[{after}]") for after in ("right", "radio")]
 CHANGES = {
     "as it is": [],
     "light 7 times brighter": [("flux_px = 4.0", "flux_px = 30.0")],
@@ -23,20 +27,40 @@ CHANGES = {
     "servo steps of 1 deg, slack 0.5": [("resolution_deg = 0.35", "resolution_deg = 1.0"), ("backlash_deg = 0.15", "backlash_deg = 0.5")],
     "25 other things": [("clutter = 9", "clutter = 25")],
     "objects fallen": [('scenario = "default"', 'scenario = "fallen"')],
+    "joint zeros off by 0.1 deg": [("joint_zero_deg = 0.0", "joint_zero_deg = 0.1")],
     "joint zeros off by 0.3 deg": [("joint_zero_deg = 0.0", "joint_zero_deg = 0.3")],
+    "the same, zero_sd_deg = 0.3": [("joint_zero_deg = 0.0", "joint_zero_deg = 0.3"), *TOLD],
+    "joint zeros right, zero_sd_deg = 0.3": TOLD,
 }
 OBJECTS = ("box", "cup", "can")
 RIGHT_MM = 10.0
+CHI2_95 = 7.815  # of three degrees of freedom
+
+
+def determinant(m):
+    (a, b, c), (d, e, f), (g, h, i) = m
+    return a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+
+
+def squared(covariance, error):
+    """error' covariance^-1 error, by Cramer's rule."""
+    replaced = lambda k: [[error[i] if j == k else covariance[i][j] for j in range(3)] for i in range(3)]
+    whole = determinant(covariance)
+    return sum(error[k] * determinant(replaced(k)) / whole for k in range(3))
 
 
 def find(program, config, name, seed):
-    """Error of the position (mm), or why there is none."""
+    """Error of the position (mm) and whether its ellipsoid holds the truth, or why there is no position."""
     command = [program, "find", name, "--config", config, "--seed", str(seed), "--json"]
     ran = subprocess.run(command, capture_output=True, text=True)
     report = json.loads(ran.stdout or '{"reason": "no report"}')
     if not report.get("found"):
         return report["reason"]
-    return 1e3 * math.dist(report["pose"]["position"], report["truth"]["position"])
+    pose, truth = report["pose"], report["truth"]["position"]
+    error = [1e3 * (a - b) for a, b in zip(pose["position"], truth)]
+    # Rotation comes first in a pose's covariance.
+    covariance = [[1e6 * pose["covariance"][6 * (i + 3) + j + 3] for j in range(3)] for i in range(3)]
+    return math.hypot(*error), squared(covariance, error) < CHI2_95
 
 
 def main():
@@ -45,7 +69,7 @@ def main():
     parser.add_argument("--seeds", type=int, default=12)
     parser.add_argument("--jobs", type=int, default=2)
     args = parser.parse_args()
-    print(f"{'':<34} {'runs':>5} {'found':>6} {'right':>6} {'med mm':>7} {'p90 mm':>7}")
+    print(f"{'':<36} {'runs':>5} {'found':>6} {'right':>6} {'held':>6} {'med mm':>7} {'p90 mm':>7}")
     with tempfile.TemporaryDirectory() as folder, concurrent.futures.ThreadPoolExecutor(args.jobs) as pool:
         subprocess.run([args.program, "workcell", folder], check=True, capture_output=True)
         config = os.path.join(folder, "workcell.toml")
@@ -58,10 +82,11 @@ def main():
             open(config, "w").write(text)
             runs = [(name, seed) for seed in range(1, args.seeds + 1) for name in OBJECTS]
             results = list(pool.map(lambda run: find(args.program, config, *run), runs))
-            errors = sorted(r for r in results if not isinstance(r, str))
-            right = sum(e <= RIGHT_MM for e in errors)
+            found = [r for r in results if not isinstance(r, str)]
+            errors = sorted(error for error, _ in found)
+            right, held = sum(e <= RIGHT_MM for e in errors), sum(holds for _, holds in found)
             at = lambda share: errors[min(int(share * len(errors)), len(errors) - 1)] if errors else math.nan
-            print(f"{change:<34} {len(runs):>5} {len(errors):>6} {right:>6} {at(0.5):>7.2f} {at(0.9):>7.2f}", flush=True)
+            print(f"{change:<36} {len(runs):>5} {len(errors):>6} {right:>6} {held:>6} {at(0.5):>7.2f} {at(0.9):>7.2f}", flush=True)
 
 
 main()

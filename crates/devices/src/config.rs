@@ -99,6 +99,10 @@ pub struct HeadConfig {
     pub camera: CameraConfig,
     /// The servos.
     pub servos: ServosConfig,
+    /// Standard deviation of the joints' zeros (degrees): how far the description may be from where the
+    /// joints really are. Zero when left out; a calibration writes what it leaves.
+    #[serde(default)]
+    pub zero_sd_deg: f64,
 }
 
 /// A camera's driver and its nominal lens.

@@ -14,10 +14,9 @@
 //! [`ReaimConfig::depth_sigma`], when another batch would narrow it by less than
 //! [`ReaimConfig::least_gain`], or after [`ReaimConfig::most`].
 
-use nalgebra::Matrix2;
 use vergence_geometry::GaussianPoint;
 
-use crate::calibration::middle;
+use crate::calibration::{distance_sigma, middle};
 use crate::{Fixation, Landmark, Noise, PanTiltHead, TriangulateError, triangulate_many};
 
 /// Aims between two looks at what has been reached.
@@ -138,15 +137,7 @@ impl<'a> Reaim<'a> {
 
     /// Standard deviation of the distance if encoders had no steps.
     fn common_sigma(&self, landmark: &Landmark) -> f64 {
-        let light = &landmark.point.position;
-        let ideal = |k: usize| {
-            let angles = self.heads[k].aim_at(light);
-            let pixel = self.heads[k].project(angles, light)?;
-            Some([Fixation { angles, pixel, pixel_covariance: Matrix2::zeros() }])
-        };
-        let (Some(left), Some(right)) = (ideal(0), ideal(1)) else { return 0.0 };
-        let noise = Noise { step_sigma: 0.0, ..self.noise };
-        let known = triangulate_many(self.heads, [&left, &right], &noise);
-        known.map_or(0.0, |known| known.distance_from(&middle(self.heads)).1)
+        let common = self.noise.common_sigma;
+        distance_sigma(self.heads, &landmark.point.position, common).unwrap_or(0.0)
     }
 }

@@ -27,6 +27,9 @@ const AHEAD: Duration = Duration::from_millis(100);
 /// Pictures that may have been exposed before the heads stood still, at the most.
 const STALE_FRAMES: usize = 30;
 
+/// Heads whose zeros may be further off (degrees) do not look where they are sent.
+const MOST_ZERO_SD_DEG: f64 = 5.0;
+
 /// Why a robot could not be put together.
 #[derive(Debug, thiserror::Error)]
 pub enum SystemError {
@@ -46,6 +49,16 @@ pub enum SystemError {
         /// What is wrong.
         source: HeadError,
     },
+    /// Nobody can work with joints of which nothing is known.
+    #[error(
+        "{side} head: zero_sd_deg = {degrees} is no deviation of a joint's zero: give one from 0 to {MOST_ZERO_SD_DEG} degrees"
+    )]
+    ZeroSd {
+        /// Which head.
+        side: &'static str,
+        /// What the configuration says.
+        degrees: f64,
+    },
     /// The URDF's arm or gripper lacks something.
     #[error("arm: {0}")]
     Arm(#[from] DescriptionError),
@@ -60,6 +73,8 @@ pub struct System {
     pub robot: Robot,
     /// Left and right head: kinematics in the base frame and the camera's lens.
     pub heads: [PanTiltHead; 2],
+    /// Standard deviation of the joints' zeros (rad), of the worse known head.
+    pub zero_sd: f64,
     /// Whose signature a record must bear; without, unsigned records do as well.
     pub required_signers: Option<TrustedKeys>,
     /// The arm's geometry for the planner, on robots that have an arm.
@@ -114,7 +129,8 @@ impl System {
         let hand = robot.arm.is_some().then(|| Hand::read(config, description)).transpose()?;
         let heads =
             [head(config, description, Side::Left)?, head(config, description, Side::Right)?];
-        Ok(System { robot, heads, required_signers: None, hand })
+        let zero_sd = zero_sd(config, Side::Left)?.max(zero_sd(config, Side::Right)?);
+        Ok(System { robot, heads, zero_sd, required_signers: None, hand })
     }
 
     /// Reads the encoders of both heads.
@@ -231,6 +247,13 @@ fn slew_time(turn: f64, rated: f64, told: Option<f64>) -> Duration {
     let rated = rated.max(SLOWEST);
     let speed = told.filter(|told| *told > 0.0).map_or(rated, |told| told.min(rated));
     Duration::try_from_secs_f64(turn.abs() / speed).unwrap_or(Duration::ZERO)
+}
+
+/// How well a head's zeros are known (rad).
+fn zero_sd(config: &Config, side: Side) -> Result<f64, SystemError> {
+    let degrees = config.head(side).zero_sd_deg;
+    let known = (0.0..=MOST_ZERO_SD_DEG).contains(&degrees);
+    known.then(|| degrees.to_radians()).ok_or(SystemError::ZeroSd { side: side.name(), degrees })
 }
 
 /// The geometry of one head as configuration and URDF have it.

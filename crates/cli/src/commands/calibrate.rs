@@ -171,9 +171,8 @@ fn noise(system: &System) -> Noise {
 }
 
 fn figures(calibration: &Calibration) -> Figures {
-    let from = middle(&calibration.heads);
     let at = |distance: f64| {
-        let ahead: Point3<f64> = from + Vector3::new(0.9, 0.0, -0.4).normalize() * distance;
+        let ahead = ahead(calibration, distance);
         let sigma = calibration.distance_sigma(&ahead).unwrap_or(f64::INFINITY);
         DistanceError { distance, error: SIGMAS_95 * sigma }
     };
@@ -183,6 +182,11 @@ fn figures(calibration: &Calibration) -> Figures {
         distance_95: [0.5, 1.0, 2.0].map(at).into(),
         focal_px: [0, 1].map(|k| calibration.heads[k].camera.fx),
     }
+}
+
+/// A place on a table before the heads, so far away (m).
+fn ahead(calibration: &Calibration, distance: f64) -> Point3<f64> {
+    middle(&calibration.heads) + Vector3::new(0.9, 0.0, -0.4).normalize() * distance
 }
 
 /// Refuses to write over what was read, before anything is measured.
@@ -218,9 +222,12 @@ fn write(args: &Calibrate, opened: &Opened, calibration: &Calibration) -> Result
     let mut table: toml::Table = text.parse().map_err(|e| failed(&e))?;
     let name = urdf.file_name().unwrap_or_default().to_string_lossy().into_owned();
     table.insert("robot".into(), name.into());
+    let ahead = ahead(calibration, 1.0);
+    let zero_sd_deg = calibration.zero_sigma(&ahead).unwrap_or_default().to_degrees();
     for (side, head) in Side::BOTH.into_iter().zip(&calibration.heads) {
-        let camera = table.get_mut(side.name()).and_then(|head| head.get_mut("camera"));
-        if let Some(toml::Value::Table(camera)) = camera {
+        let Some(toml::Value::Table(wiring)) = table.get_mut(side.name()) else { continue };
+        wiring.insert("zero_sd_deg".into(), zero_sd_deg.into());
+        if let Some(toml::Value::Table(camera)) = wiring.get_mut("camera") {
             set_lens(camera, head);
         }
     }

@@ -24,11 +24,11 @@
 mod diagnosis;
 mod solver;
 
-use nalgebra::{DMatrix, Matrix3, Matrix3xX, Matrix6, Point3, SVector, Vector3, Vector6};
+use nalgebra::{DMatrix, Matrix2, Matrix3, Matrix3xX, Matrix6, Point3, SVector, Vector3, Vector6};
 use vergence_geometry::gaussian::perturb;
 
 use crate::triangulation::nearest_to_rays;
-use crate::{Fixation, Noise, PanTiltHead};
+use crate::{Fixation, Noise, PanTiltHead, triangulate_many};
 
 /// Unknowns of one head: three transforms, focal length, principal point, radial distortion.
 pub(crate) const HEAD_UNKNOWNS: usize = 22;
@@ -326,6 +326,15 @@ impl Calibration {
         (variance >= 0.0).then(|| variance.sqrt())
     }
 
+    /// Standard deviation (rad) of joint zeros that make the distance of a point as uncertain as the whole
+    /// calibration leaves it: what to tell whoever uses its heads and knows only of angles. `None` where
+    /// the heads cannot look at it.
+    pub fn zero_sigma(&self, point: &Point3<f64>) -> Option<f64> {
+        // Small enough to be linear, large against what triangulation takes for nothing.
+        const UNIT: f64 = 1e-3;
+        Some(UNIT * self.distance_sigma(point)? / distance_sigma(&self.heads, point, UNIT)?)
+    }
+
     /// Covariance of one head's fixed transform (0 base to pan joint, 1 pan to tilt joint, 2 tilt to
     /// optical frame), in the tangent order rotation, translation.
     pub fn transform_covariance(&self, head: usize, block: usize) -> Matrix6<f64> {
@@ -365,6 +374,24 @@ impl Calibration {
 pub fn middle(heads: &[PanTiltHead; 2]) -> Point3<f64> {
     let origin = |k: usize| heads[k].chain.joints[0].parent_from_joint.translation.vector;
     Point3::from((origin(0) + origin(1)) / 2.0)
+}
+
+/// Standard deviation (m) of the distance of a light from the middle of the heads when nothing is unknown
+/// but what every joint's angles have in common, of this deviation (rad). `None` where the heads cannot
+/// look at it.
+pub(crate) fn distance_sigma(
+    heads: &[PanTiltHead; 2],
+    light: &Point3<f64>,
+    common_sigma: f64,
+) -> Option<f64> {
+    let ideal = |k: usize| {
+        let angles = heads[k].aim_at(light);
+        let pixel = heads[k].project(angles, light)?;
+        Some([Fixation { angles, pixel, pixel_covariance: Matrix2::zeros() }])
+    };
+    let noise = Noise { step_sigma: 0.0, common_sigma };
+    let known = triangulate_many(heads, [&ideal(0)?, &ideal(1)?], &noise).ok()?;
+    Some(known.distance_from(&middle(heads)).1)
 }
 
 /// A head with its unknowns changed: three tangents (rotation, translation) in parent axes, log focal

@@ -172,13 +172,14 @@ impl Run<'_> {
     /// Angle noise of the coarser head.
     pub(super) fn noise(&self) -> Noise {
         let servos = self.system.robot.heads.iter().map(|head| &head.pan_tilt);
-        servos.fold(Noise { step_sigma: 0.0, common_sigma: 0.0 }, |noise, servo| {
+        let servos = servos.fold(Noise { step_sigma: 0.0, common_sigma: 0.0 }, |noise, servo| {
             let of_servo = Noise::of_servo(servo.resolution(), servo.backlash());
             Noise {
                 step_sigma: noise.step_sigma.max(of_servo.step_sigma),
                 common_sigma: noise.common_sigma.max(of_servo.common_sigma),
             }
-        })
+        });
+        Noise { common_sigma: servos.common_sigma.hypot(self.system.zero_sd), ..servos }
     }
 }
 
