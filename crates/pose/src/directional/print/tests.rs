@@ -10,6 +10,7 @@ use vergence_tag::Record;
 
 use super::*;
 use crate::directional::equations::Move;
+use crate::directional::level::{Reduced, Region};
 use crate::directional::refine::{FINAL, STEPS};
 use crate::directional::{Config, prepare};
 use crate::model::Model;
@@ -252,4 +253,34 @@ fn what_is_far_off_and_what_is_little_says_nothing() {
     let mut two = squares(10, 0.0);
     two.extend(squares(10, 0.0).into_iter().map(|p| Patch { part: 1, ..p }));
     assert!((evidence(&two) - 2.0 * evidence(&squares(10, 0.0))).abs() < 1e-9);
+}
+
+/// A small picture's level, and the pixel of it that shows the picture's middle.
+fn level(grey: impl Fn(f64, f64) -> f64) -> (Level, (usize, usize)) {
+    let image = Image::from_fn(64, 64, |x, y| grey(x as f64, y as f64).round() as u8);
+    let region = Region::around(&[Point2::new(32.0, 32.0)], 24.0, 64, 64).unwrap();
+    let level = Reduced::new(&image, &region, 1).smoothed(0.35);
+    let (x, y) = level.from_picture(32.0, 32.0);
+    (level, (x.round() as usize, y.round() as usize))
+}
+
+#[test]
+fn a_lamp_that_lights_one_view_from_the_side_does_not_move_print() {
+    let print = |x: f64, y: f64| 110.0 + 25.0 * (x / 1.9).sin() * (y / 2.3 + 0.5).cos();
+    let (first, middle) = level(print);
+    let here = square::print_at(&first, middle.0, middle.1).unwrap();
+    for shift in [-0.4, 0.0, 0.3] {
+        let moved = |x: f64, y: f64| print(x - shift, y);
+        let (second, there) = level(|x, y| 0.8 * moved(x, y) + 2.0 * (x - 32.0) - 1.5 * (y - 32.0));
+        let place = Place {
+            middle,
+            there: Vector2::new(there.0 as f64, there.1 as f64),
+            affine: Matrix2::identity(),
+            bend: Default::default(),
+            epipolar: Vector2::x(),
+            by_turn: Default::default(),
+        };
+        let found = square::find(&here, &first, &second, &place).unwrap();
+        assert!((found.shift - shift).abs() < 0.05, "{:.3}, it is {shift}", found.shift);
+    }
 }
