@@ -187,6 +187,13 @@ fn what_cannot_be_written_is_refused_before_the_measurement() {
         let reason = told["reason"].as_str().unwrap();
         assert!(reason.contains("cannot write"), "{out}: {reason}");
     }
+    // There is no joint in which to write how a camera is mounted.
+    let bare = vergence_sim::EMBEDDED_CONFIG.replace("\"left_optical_frame\"", "\"left_tilt\"");
+    std::fs::write(folder.join("bare.toml"), bare).unwrap();
+    let arguments = ["--config", "bare.toml", "--object", "nobody", "--out", "better.toml"];
+    let (status, told) = vergence(&folder, &[&["calibrate"][..], &arguments].concat());
+    let reason = told["reason"].as_str().unwrap();
+    assert!(status == Some(1) && reason.contains("no fixed joint"), "{reason}");
     assert!(!folder.join("taken.toml").exists());
     assert_eq!(std::fs::read_to_string(folder.join("kept.toml")).unwrap(), "kept");
     std::fs::remove_dir_all(&folder).unwrap();

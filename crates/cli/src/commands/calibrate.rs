@@ -7,7 +7,8 @@ use nalgebra::{Point3, Vector3};
 use serde::Serialize;
 use serde_json::json;
 use vergence::{CollectConfig, FindConfig, Session, System};
-use vergence_devices::Side;
+use vergence_devices::calibrated::WriteError;
+use vergence_devices::{Description, Side};
 use vergence_head::calibration::{Calibration, CalibrationConfig, middle};
 use vergence_head::{Noise, PanTiltHead};
 
@@ -117,6 +118,8 @@ fn calibrate(args: &Calibrate) -> Result<Outcome, Failure> {
     let robot = RobotArgs { config: Some(args.config.clone()), seed: args.seed };
     let mut opened = robot.open()?;
     keeps_what_was_read(args, &opened)?;
+    // A description that cannot take what will come out is told of before anybody measures.
+    with_heads(&opened, &opened.system.heads).map_err(|e| cannot_write(&args.out, &e))?;
     let session = sightings(args, &mut opened)?;
     let noise = noise(&opened.system);
     let config = CalibrationConfig { noise, ..CalibrationConfig::default() };
@@ -204,19 +207,27 @@ fn keeps_what_was_read(args: &Calibrate, opened: &Opened) -> Result<(), Failure>
     }
 }
 
+/// The description with other heads.
+fn with_heads(opened: &Opened, heads: &[PanTiltHead; 2]) -> Result<Description, WriteError> {
+    Side::BOTH.into_iter().zip(heads).try_fold(
+        opened.description.clone(),
+        |before, (side, head)| {
+            before.with_chain("base", &opened.config.head(side).optical_frame, &head.chain)
+        },
+    )
+}
+
+fn cannot_write(path: &Path, error: &dyn std::fmt::Display) -> Failure {
+    Failure::failed(
+        format!("cannot write {}: {error}", path.display()),
+        "choose a file that you may write; the URDF must be plain, without macros",
+    )
+}
+
 /// Writes URDF and configuration.
 fn write(args: &Calibrate, opened: &Opened, calibration: &Calibration) -> Result<(), Failure> {
-    let failed = |error: &dyn std::fmt::Display| {
-        Failure::failed(
-            format!("cannot write {}: {error}", args.out.display()),
-            "choose a file that you may write; the URDF must be plain, without macros",
-        )
-    };
-    let mut description = opened.description.clone();
-    for (side, head) in Side::BOTH.into_iter().zip(&calibration.heads) {
-        let tip = &opened.config.head(side).optical_frame;
-        description = description.with_chain("base", tip, &head.chain).map_err(|e| failed(&e))?;
-    }
+    let failed = |error: &dyn std::fmt::Display| cannot_write(&args.out, error);
+    let description = with_heads(opened, &calibration.heads).map_err(|e| failed(&e))?;
     let urdf = args.out.with_extension("urdf");
     let text = std::fs::read_to_string(&args.config).map_err(|e| failed(&e))?;
     let mut table: toml::Table = text.parse().map_err(|e| failed(&e))?;
