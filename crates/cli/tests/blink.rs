@@ -121,6 +121,32 @@ fn an_episode_that_cannot_be_read_stops_no_other() {
 }
 
 #[test]
+fn what_a_request_has_wrong_is_told_with_its_file_and_tag() {
+    let dir = Path::new(env!("CARGO_TARGET_TMPDIR")).join("blink-requests");
+    let _ = std::fs::remove_dir_all(&dir);
+    std::fs::create_dir_all(&dir).unwrap();
+    episode(&dir);
+    let path = dir.join("request.json");
+    let good: Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+    for (place, bad, said) in [
+        ("/tags/0/chip_seconds", json!(-1.0), "tag tag-0: chip_seconds"),
+        ("/tags/0/chip_seconds", json!(1e-9), "tag tag-0: "),
+        ("/exposure_seconds", json!(11.0), "not between 0 and 10 s"),
+        ("/tags/0/pattern", json!("012"), "line 1"),
+    ] {
+        let mut request = good.clone();
+        *request.pointer_mut(place).unwrap() = bad;
+        std::fs::write(&path, request.to_string()).unwrap();
+        let recording = dir.join("recording.mcap");
+        let arguments = [recording.to_str().unwrap(), "--request", path.to_str().unwrap()];
+        let output = vergence(&[&["blink"][..], &arguments].concat());
+        let told = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{told}");
+        assert!(told.contains("request.json: ") && told.contains(said), "{place}: {told}");
+    }
+}
+
+#[test]
 fn options_without_effect_are_misuse() {
     for args in [
         &["--bound", "--runs", "0"][..],

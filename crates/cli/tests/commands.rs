@@ -313,6 +313,9 @@ fn a_negative_number_is_told_what_should_stand_there() {
         (&["sim", "--seconds", "-1"], "--seconds is not a time"),
         (&["blink", "--bound", "--minutes", "-1"], "not between 0 and"),
         (&["calibrate", "--config", "x", "--out", "y", "--length", "-1"], "give them in metres"),
+        (&["find", "cup", "--seed", "-1"], "invalid value '-1' for '--seed <SEED>'"),
+        (&["evaluate", "pose", "--scenes", "-3"], "invalid value '-3' for '--scenes <SCENES>'"),
+        (&["experiment", "1", "--seeds", "-3"], "invalid value '-3' for '--seeds <SEEDS>'"),
     ] {
         let output = vergence(args);
         let told = String::from_utf8_lossy(&output.stderr);

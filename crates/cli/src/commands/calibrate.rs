@@ -39,17 +39,17 @@ pub struct Calibrate {
     #[arg(long, default_value_t = CollectConfig::default().views as u16, value_parser = clap::value_parser!(u16).range(4..=1000))]
     views: u16,
     /// Length (m) between the two places of a pair.
-    #[arg(long, default_value_t = 0.5, allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 0.5)]
     length: f64,
     /// Standard deviation (m) of that length.
-    #[arg(long, default_value_t = 0.0005, allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 0.0005)]
     length_sigma: f64,
     /// Each place is measured in the base frame, to --place-sigma, and asked for on the terminal: then
     /// the heads know where they stand in base.
     #[arg(long)]
     measured: bool,
     /// Standard deviation (m) of each coordinate of a measured place.
-    #[arg(long, default_value_t = 0.001, allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 0.001)]
     place_sigma: f64,
     /// Seed of the simulated workcell.
     #[arg(long, default_value_t = 1)]

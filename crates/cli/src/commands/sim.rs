@@ -29,7 +29,7 @@ pub struct Sim {
     #[arg(long, value_name = "FILE")]
     write_config: Option<PathBuf>,
     /// End after so many seconds.
-    #[arg(long, value_name = "SECONDS", allow_negative_numbers = true)]
+    #[arg(long, value_name = "SECONDS")]
     seconds: Option<f64>,
     /// Read lines "OBJECT X Y Z" from standard input and hold that object's light there (m, base), shining
     /// towards the heads: for `vergence calibrate` over the wires.

@@ -65,10 +65,10 @@ struct Blink {
     #[arg(long, default_value = "10")]
     pattern: Bits,
     /// How long a chip lasts (ms).
-    #[arg(long, default_value_t = 100.0, allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 100.0)]
     chip_ms: f64,
     /// How long the light plays (s); a tag may be set to end it earlier.
-    #[arg(long, default_value_t = 5.0, allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 5.0)]
     seconds: f64,
     #[command(flatten)]
     robot: RobotArgs,

@@ -53,7 +53,7 @@ pub struct Args {
     #[arg(long, default_value_t = 100, requires = "bound", value_parser = value_parser!(u32).range(1..=100_000))]
     runs: u32,
     /// Minutes of tag-free video for --bound
-    #[arg(long, default_value_t = 5.0, requires = "bound", value_parser = minutes, allow_negative_numbers = true)]
+    #[arg(long, default_value_t = 5.0, requires = "bound", value_parser = minutes)]
     minutes: f64,
     /// How to look
     #[arg(long, value_enum, default_value = "sequential")]
@@ -169,12 +169,12 @@ fn look(
     let request = BlinkRequest::read(request)?;
     let mut finder: Box<dyn Finder> = match method {
         Method::Paper => {
-            let finder = paper::PaperFinder::new(request.requests()?, paper::Config::default());
+            let finder = paper::PaperFinder::new(request.tags.clone(), paper::Config::default());
             Box::new(finder.map_err(|e| refused(&e))?)
         }
         Method::Sequential => {
             let config = sequential::Config::default();
-            let finder = sequential::SequentialFinder::new(request.requests()?, config);
+            let finder = sequential::SequentialFinder::new(request.tags.clone(), config);
             Box::new(finder.map_err(|e| refused(&e))?)
         }
     };
@@ -183,10 +183,10 @@ fn look(
     let unreadable = |e: RecordingError| {
         Failure::misuse(e, "name a ROS 2 recording (MCAP) and, as `camera`, its image topic")
     };
-    let frames_of = recording::frames(recording, &request.camera, request.exposure());
+    let frames_of = recording::frames(recording, &request.camera, request.exposure);
     for frame in frames_of.map_err(unreadable)? {
         let mut frame = frame.map_err(unreadable)?;
-        frame.row_time = request.row_time();
+        frame.row_time = request.row_time;
         first.get_or_insert(frame.stamp);
         finder.push(&frame).map_err(|e| refused(&e))?;
         frames += 1;
@@ -201,7 +201,7 @@ fn look(
     };
     let seconds = started.elapsed().as_secs_f64();
     if let Some(dir) = save {
-        picture::save(dir, &kept, &request.requests()?, finder.decisions())?;
+        picture::save(dir, &kept, &request.tags, finder.decisions())?;
     }
     Ok(Report::new(&request, finder.decisions(), first, frames, seconds))
 }
