@@ -54,8 +54,8 @@ const LIP: f64 = 0.003;
 const LIP_SD: f64 = 0.0015;
 /// Deviation of the swelling of silhouettes (px).
 const SWELL_SD_PX: f64 = 0.4;
-/// Deviation of the logarithm of the object's size: records are measured by rulers.
-const SIZE_SD: f64 = 0.007;
+/// Deviation of the logarithm of the object's size: one percent.
+const SIZE_SD: f64 = 0.01;
 
 /// Deviation (px) of a site's edge when a pass works with `sd_px`.
 pub fn deviation(site: &Site, sd_px: f64) -> f64 {
