@@ -92,7 +92,7 @@ fn heads_that_say_how_far_their_zeros_may_be_off_are_trusted_no_further() {
     let folder = perturbed("zeros");
     let config =
         vergence_sim::EMBEDDED_CONFIG.replace("joint_zero_deg = 0.0 ", "joint_zero_deg = 0.3 ");
-    let told = config.replace("servos = {", "zero_sd_deg = 0.3\nservos = {");
+    let told = config.replace("zero_sd_deg = 0.0 ", "zero_sd_deg = 0.3 ");
     let (mut held, mut sums, mut runs) = ([0, 0], [0.0, 0.0], 0);
     for seed in ["1", "2", "4"] {
         for object in ["box", "cup", "can"] {
@@ -123,8 +123,8 @@ fn heads_that_say_how_far_their_zeros_may_be_off_are_trusted_no_further() {
 fn deviations_of_zeros_that_cannot_be_are_refused() {
     let folder = perturbed("zeros-refused");
     for bad in ["-0.1", "nan", "inf", "30.0"] {
-        let told = format!("zero_sd_deg = {bad}\nservos = {{");
-        let config = vergence_sim::EMBEDDED_CONFIG.replacen("servos = {", &told, 1);
+        let told = format!("zero_sd_deg = {bad} ");
+        let config = vergence_sim::EMBEDDED_CONFIG.replacen("zero_sd_deg = 0.0 ", &told, 1);
         std::fs::write(folder.join("bad.toml"), config).unwrap();
         let output = Command::new(env!("CARGO_BIN_EXE_vergence"))
             .args(["find", "cup", "--config", "bad.toml"])
