@@ -235,6 +235,8 @@ pub(crate) struct Run<'a> {
     pub(crate) heard: Vec<Advertisement>,
     /// Time between two pictures, known when the tag blinks.
     interval: Duration,
+    /// Standard deviation of the joints' zeros (rad) that positions are as uncertain by.
+    pub(crate) zero_sd: f64,
 }
 
 impl<'a> Run<'a> {
@@ -244,6 +246,7 @@ impl<'a> Run<'a> {
         config: &'a FindConfig,
         observer: &'a mut dyn Observer,
     ) -> Self {
+        let zero_sd = system.zero_sd;
         Run {
             system,
             config,
@@ -252,6 +255,7 @@ impl<'a> Run<'a> {
             landmark: None,
             heard: Vec::new(),
             interval: Duration::ZERO,
+            zero_sd,
         }
     }
 }

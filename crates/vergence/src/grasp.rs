@@ -123,7 +123,12 @@ pub fn grasp(
     config: &GraspConfig,
     observer: &mut dyn Observer,
 ) -> Report {
+    let lit = system.hand.as_ref().is_some_and(|hand| hand.light.is_some());
     let mut run = Run::new(system, &config.find, observer);
+    if lit {
+        // The object is wanted where the hand's light is seen beside it: zeros move both alike.
+        run.zero_sd = 0.0;
+    }
     let found = run.all(object);
     let mut outcome = GraspReport::default();
     let failure = match &found {
@@ -286,11 +291,13 @@ impl Attempt<'_, '_> {
     }
 
     /// The landmark is measured anew and the object recognised anew, and placed beside the hand when that has
-    /// a light. The plan was sure enough of the first look, so that holds when the second gives nothing.
+    /// a light. The plan was sure enough of the first look, so that holds when the second gives nothing; but
+    /// not where it was sure only because the hand would be seen beside the object.
     fn look_again(&mut self, hand: &Hand) -> Result<Found, Failure> {
         let mut found = match self.run.again(self.found) {
             Ok(found) => found,
             Err(Stop::Device(error)) => return Err(error.into()),
+            Err(stop) if self.needs_the_hand() => return Err(stop.into()),
             Err(stop) => {
                 self.report.second_look = Some(stop.to_string());
                 return Ok(self.found.clone());
@@ -307,9 +314,15 @@ impl Attempt<'_, '_> {
                 self.report.hand_off_mm = Some(1e3 * (sight.by_joints - sight.seen).norm());
             }
             Err(Stop::Device(error)) => return Err(error.into()),
+            Err(stop) if self.needs_the_hand() => return Err(stop.into()),
             Err(stop) => self.report.hand_unseen = Some(stop.to_string()),
         }
         Ok(found)
+    }
+
+    /// Whether nothing is known well enough without the hand's light.
+    fn needs_the_hand(&self) -> bool {
+        self.run.zero_sd < self.run.system.zero_sd
     }
 
     fn close(&mut self, plan: &Plan) -> Result<(), Failure> {

@@ -179,7 +179,7 @@ impl Run<'_> {
                 common_sigma: noise.common_sigma.max(of_servo.common_sigma),
             }
         });
-        Noise { common_sigma: servos.common_sigma.hypot(self.system.zero_sd), ..servos }
+        Noise { common_sigma: servos.common_sigma.hypot(self.zero_sd), ..servos }
     }
 }
 
