@@ -109,6 +109,17 @@ fn a_light_on_the_gripper_tells_how_far_the_heads_are_off() {
         );
         assert_eq!(grasp["succeeded"], true, "{grasp}");
     }
+    // A hand that is not seen after all ends the grasp where the plan counted on it.
+    let unseen = text.replace("tag = { object_id = \"gripper\"", "tag = { object_id = \"nobody\"");
+    for (stated, ends) in [("0.2", true), ("0.0", false)] {
+        let stated = format!("zero_sd_deg = {stated}");
+        std::fs::write(&path, unseen.replace("zero_sd_deg = 0.2", &stated)).unwrap();
+        let (_, report) = grasp(&path, &["--seed", "8"]);
+        let why = report["grasp"]["reason"].as_str().unwrap_or_default();
+        assert_eq!(why.contains("\"nobody\" answers"), ends, "{report}");
+        assert_eq!(report["grasp"]["hand_unseen"].is_null(), ends, "{report}");
+        assert_eq!(report["grasp"]["closed_width"].is_null(), ends, "{report}");
+    }
     // Without the light nothing is known well enough, whoever says so.
     std::fs::write(&path, text.replace("tag = {", "# tag = {")).unwrap();
     refused(&path, "the pose is too uncertain");
