@@ -14,22 +14,28 @@ const CHI2_95: f64 = 7.815;
 /// Between the heads of the embedded workcell (m).
 const BASELINE: f64 = 0.2;
 
+/// The embedded workcell's configuration with other values of some keys, wherever they stand.
+fn embedded_with(changes: &[(&str, &str, &str)]) -> String {
+    let mut config = vergence_sim::EMBEDDED_CONFIG.to_owned();
+    for (key, before, after) in changes {
+        let (from, to) = (format!("{key} = {before} "), format!("{key} = {after} "));
+        assert!(config.contains(&from), "the embedded workcell has {from}");
+        config = config.replace(&from, &to);
+    }
+    config
+}
+
 /// The embedded workcell with heads that differ from their URDF, and 12-bit servos.
 fn perturbed(name: &str) -> PathBuf {
     let folder = std::env::temp_dir().join(format!("vergence-{name}-{}", std::process::id()));
     std::fs::create_dir_all(&folder).unwrap();
-    let mut config = vergence_sim::EMBEDDED_CONFIG.to_owned();
-    for (key, before, after) in [
+    let config = embedded_with(&[
         ("joint_zero_deg", "0.0", "1.0"),
         ("axis_skew_deg", "0.0", "0.5"),
         ("lever_arm", "0.0", "0.004"),
         ("focal_ratio", "0.0", "0.03"),
         ("resolution_deg", "0.35", "0.088"),
-    ] {
-        let (from, to) = (format!("{key} = {before} "), format!("{key} = {after} "));
-        assert!(config.contains(&from), "the embedded workcell has {from}");
-        config = config.replace(&from, &to);
-    }
+    ]);
     std::fs::write(folder.join("robot.toml"), config).unwrap();
     std::fs::write(folder.join("workcell.urdf"), vergence_sim::EMBEDDED_URDF).unwrap();
     folder
@@ -90,9 +96,9 @@ fn found(report: &Value) -> (Vector3<f64>, Matrix3<f64>, Vector3<f64>) {
 #[test]
 fn heads_that_say_how_far_their_zeros_may_be_off_are_trusted_no_further() {
     let folder = perturbed("zeros");
-    let config =
-        vergence_sim::EMBEDDED_CONFIG.replace("joint_zero_deg = 0.0 ", "joint_zero_deg = 0.3 ");
-    let told = config.replace("zero_sd_deg = 0.0 ", "zero_sd_deg = 0.3 ");
+    let off = ("joint_zero_deg", "0.0", "0.3");
+    let config = embedded_with(&[off]);
+    let told = embedded_with(&[off, ("zero_sd_deg", "0.0", "0.3")]);
     let (mut held, mut sums, mut runs) = ([0, 0], [0.0, 0.0], 0);
     for seed in ["1", "2", "4"] {
         for object in ["box", "cup", "can"] {
@@ -123,8 +129,7 @@ fn heads_that_say_how_far_their_zeros_may_be_off_are_trusted_no_further() {
 fn deviations_of_zeros_that_cannot_be_are_refused() {
     let folder = perturbed("zeros-refused");
     for bad in ["-0.1", "nan", "inf", "30.0"] {
-        let told = format!("zero_sd_deg = {bad} ");
-        let config = vergence_sim::EMBEDDED_CONFIG.replacen("zero_sd_deg = 0.0 ", &told, 1);
+        let config = embedded_with(&[("zero_sd_deg", "0.0", bad)]);
         std::fs::write(folder.join("bad.toml"), config).unwrap();
         let output = Command::new(env!("CARGO_BIN_EXE_vergence"))
             .args(["find", "cup", "--config", "bad.toml"])

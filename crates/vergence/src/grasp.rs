@@ -123,9 +123,8 @@ pub fn grasp(
     config: &GraspConfig,
     observer: &mut dyn Observer,
 ) -> Report {
-    let lit = system.hand.as_ref().is_some_and(|hand| hand.light.is_some());
     let mut run = Run::new(system, &config.find, observer);
-    if lit {
+    if run.system.hand.as_ref().is_some_and(|hand| hand.light.is_some()) {
         // The object is wanted where the hand's light is seen beside it: zeros move both alike.
         run.zero_sd = 0.0;
     }

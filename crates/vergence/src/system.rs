@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use vergence_devices::{
-    Config, Description, DescriptionError, DeviceError, JointReading, Robot, Side,
+    Config, Description, DescriptionError, DeviceError, JointReading, PanTilt, Robot, Side,
 };
 use vergence_geometry::Chain;
 use vergence_head::{HeadError, PanTiltHead};
@@ -131,6 +131,20 @@ impl System {
             [head(config, description, Side::Left)?, head(config, description, Side::Right)?];
         let zero_sd = zero_sd(config, Side::Left)?.max(zero_sd(config, Side::Right)?);
         Ok(System { robot, heads, zero_sd, required_signers: None, hand })
+    }
+
+    /// Encoder step of the coarser servos (rad).
+    pub fn resolution(&self) -> f64 {
+        self.coarsest(|servos| servos.resolution())
+    }
+
+    /// Slack of the coarser servos' gears, as the maker states it (rad).
+    pub fn backlash(&self) -> f64 {
+        self.coarsest(|servos| servos.backlash())
+    }
+
+    fn coarsest(&self, of: impl Fn(&dyn PanTilt) -> f64) -> f64 {
+        self.robot.heads.iter().map(|head| of(head.pan_tilt.as_ref())).fold(0.0, f64::max)
     }
 
     /// Reads the encoders of both heads.

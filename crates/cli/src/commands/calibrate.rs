@@ -169,8 +169,7 @@ fn sightings(args: &Calibrate, opened: &mut Opened) -> Result<Session, Failure> 
 
 /// Encoder noise of the coarser servos; slack that always lies on one side is part of the zeros.
 fn noise(system: &System) -> Noise {
-    let steps = system.robot.heads.iter().map(|head| head.pan_tilt.resolution());
-    Noise::of_servo(steps.fold(0.0, f64::max), 0.0)
+    Noise::of_servo(system.resolution(), 0.0)
 }
 
 fn figures(calibration: &Calibration) -> Figures {
@@ -234,10 +233,13 @@ fn write(args: &Calibrate, opened: &Opened, calibration: &Calibration) -> Result
     let name = urdf.file_name().unwrap_or_default().to_string_lossy().into_owned();
     table.insert("robot".into(), name.into());
     let ahead = ahead(calibration, 1.0);
-    let zero_sd_deg = calibration.zero_sigma(&ahead).unwrap_or_default().to_degrees();
+    let zero_sd = calibration.zero_sigma(&ahead);
     for (side, head) in Side::BOTH.into_iter().zip(&calibration.heads) {
         let Some(toml::Value::Table(wiring)) = table.get_mut(side.name()) else { continue };
-        wiring.insert("zero_sd_deg".into(), zero_sd_deg.into());
+        // Where nothing can be said what was stated stays.
+        if let Some(zero_sd) = zero_sd {
+            wiring.insert("zero_sd_deg".into(), zero_sd.to_degrees().into());
+        }
         if let Some(toml::Value::Table(camera)) = wiring.get_mut("camera") {
             set_lens(camera, head);
         }

@@ -81,8 +81,8 @@ impl Frustum {
         let a = along.xy().norm_squared() - grows * grows;
         let b = eye.xy().dot(&along.xy()) - at_eye * grows;
         let c = eye.xy().norm_squared() - at_eye * at_eye;
-        let wall = (b * b - a * c).max(-1.0).sqrt();
-        let wall = (-b - wall) / a;
+        // Not a number where the ray passes the wall by: then it is in no height.
+        let wall = (-b - (b * b - a * c).sqrt()) / a;
         let meets = |distance: f64| eye + along * distance;
         if wall > 0.0 && meets(wall).z.abs() <= self.half_height {
             let normal = self.wall(&meets(wall));

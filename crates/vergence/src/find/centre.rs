@@ -171,15 +171,13 @@ impl Run<'_> {
 
     /// Angle noise of the coarser head.
     pub(super) fn noise(&self) -> Noise {
-        let servos = self.system.robot.heads.iter().map(|head| &head.pan_tilt);
-        let servos = servos.fold(Noise { step_sigma: 0.0, common_sigma: 0.0 }, |noise, servo| {
-            let of_servo = Noise::of_servo(servo.resolution(), servo.backlash());
-            Noise {
-                step_sigma: noise.step_sigma.max(of_servo.step_sigma),
-                common_sigma: noise.common_sigma.max(of_servo.common_sigma),
-            }
-        });
-        Noise { common_sigma: servos.common_sigma.hypot(self.zero_sd), ..servos }
+        let system = &self.system;
+        self.with_zeros(Noise::of_servo(system.resolution(), system.backlash()))
+    }
+
+    /// A servo's noise with what its zero may be off by.
+    pub(super) fn with_zeros(&self, servo: Noise) -> Noise {
+        Noise { common_sigma: servo.common_sigma.hypot(self.zero_sd), ..servo }
     }
 }
 

@@ -69,9 +69,8 @@ impl Run<'_> {
 
     /// Angle noise when every joint comes from below.
     pub(crate) fn noise_from_below(&self) -> Noise {
-        let servos = self.system.robot.heads.iter().map(|head| &head.pan_tilt);
-        let slack = servos.fold(0.0, |slack: f64, servo| slack.max(servo.backlash()));
-        Noise { common_sigma: (LAG.1 * slack).hypot(self.zero_sd), ..self.noise() }
+        let lag = LAG.1 * self.system.backlash();
+        self.with_zeros(Noise { common_sigma: lag, ..self.noise() })
     }
 
     /// Looks at the light with both cameras from where the heads stand; a camera that does not see
