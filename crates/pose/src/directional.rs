@@ -165,6 +165,7 @@ pub fn recognise_traced<'a>(
         fine.extend(twins);
     }
     let mut different = search.ranked(fine, |a, b| search.is_same(a, b));
+    search.heed_ground(&mut different);
     if let Some(best) = different.first_mut() {
         search.settle(best);
     }

@@ -184,6 +184,15 @@ impl Model {
         }
     }
 
+    /// How far the object reaches from its frame's origin in a direction (unit).
+    pub(crate) fn reach(&self, direction: &Vector3<f64>) -> f64 {
+        match self {
+            Model::Polyhedron(body) => body.reach(direction),
+            Model::Frustum(body) => body.reach(direction),
+            Model::Sphere(radius) => *radius,
+        }
+    }
+
     /// The motions of the object frame that leave its form as it is to within a tolerance (m), of a
     /// body with flat faces.
     pub fn symmetries(&self, tolerance: f64) -> Vec<Transform> {

@@ -20,7 +20,7 @@ use multiversion::multiversion;
 use nalgebra::{Cholesky, Const, Matrix6, RowVector2, SMatrix, SVector, Vector2, Vector3};
 
 use super::landmark::Landmark;
-use super::print::{PRINT_SD_PX, PRINT_TAIL, Patch, SQUARE_TAIL, SQUARE_WORTH, SURFACE_SD};
+use super::print::{BETWEEN_TAIL, Patch, SQUARE_TAIL};
 use super::sites::{ByShared, LIP_AT, SHARED, Site};
 
 /// Unknowns of each view: small turns of its camera.
@@ -159,23 +159,27 @@ impl Equations {
     /// far the unknowns are from where its residuals were measured.
     pub fn surface(&mut self, patches: &[Patch], offsets: &[Offsets], moved: &Move) {
         let Some(first) = patches.first() else { return };
-        let part = SURFACES | u32::from(first.part);
+        let Offsets { part, .. } = Offsets::of_surface(first.part, 0.0);
         let seen = seen(offsets, part);
         let doubt = self.doubt * self.doubt;
-        let between = tailed(PRINT_SD_PX * PRINT_SD_PX, seen.own_px[0], PRINT_TAIL);
+        let trust = first.trust();
+        let shared = tailed(trust.surface_sd.powi(2), seen.shared, trust.surface_tail);
+        let slope = trust.slope_sd.powi(2).max(1e-12);
+        let between = tailed(trust.between_sd_px.powi(2), seen.own_px[0], BETWEEN_TAIL);
         let mut sums = Sums::new();
-        // A surface has no tilt of its own, and what the views differ by is in one place.
-        let priors = [SURFACE_SD * SURFACE_SD, 1.0, between, 1.0];
+        // In place of a part's tilt and of its offset in a view a surface has slopes and what the views
+        // differ by.
+        let priors = [shared, slope, between, slope];
         (ALL..).zip(priors).for_each(|(k, variance)| sums.a[k][k] = (doubt * variance).recip());
         for patch in patches {
             let mut by = by_all(&patch.by_shared, &patch.by_turn);
-            by[ALL] = patch.by_surface;
-            by[ALL + 2] = 1.0;
+            let own = [patch.by_surface, patch.by_slope.x, 1.0, patch.by_slope.y];
+            by[ALL..WITH_PART].copy_from_slice(&own);
             let residual = patch.left(moved);
             let left = residual - patch.by_surface * seen.shared - seen.own_px[0];
             // Heavy tails: gloss, and what stands before the object in one view.
             let variance = tailed(patch.noise_px * patch.noise_px, left, SQUARE_TAIL);
-            sums.add(SQUARE_WORTH / variance, residual, &by);
+            sums.add(trust.worth / variance, residual, &by);
         }
         let (rows, rhs) = absorb(&mut self.sums, sums);
         self.parts.push(Eliminated { part, rows, rhs });
@@ -282,7 +286,7 @@ fn seen(offsets: &[Offsets], part: u32) -> Offsets {
 /// Variance of what has heavy tails, a Student's t of so many degrees of freedom, once it was seen to be
 /// off by so much: by much is less surprising then.
 fn tailed(variance: f64, seen: f64, tail: f64) -> f64 {
-    (tail * variance + seen * seen) / (tail + 1.0)
+    if tail.is_infinite() { variance } else { (tail * variance + seen * seen) / (tail + 1.0) }
 }
 
 /// Variance of a part's edges in each view about their mean (px^2).
@@ -412,6 +416,13 @@ pub struct Offsets {
     shared: f64,
     /// In each view beside that (px).
     own_px: [f64; VIEWS],
+}
+
+impl Offsets {
+    /// Of one of the surfaces that have print, by so much (m).
+    pub(super) fn of_surface(part: u16, shared: f64) -> Self {
+        Offsets { part: SURFACES | u32::from(part), shared, ..Offsets::default() }
+    }
 }
 
 /// What the equations give.

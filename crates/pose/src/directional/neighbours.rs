@@ -16,7 +16,7 @@ use nalgebra::{Matrix6, Vector6};
 use vergence_geometry::gaussian::{difference, perturb};
 
 use super::equations::{Move, by_part};
-use super::print;
+use super::print::{self, Patch};
 use super::refine::{EDGE_SD_PX, FINAL, Pass, Refined, STEPS};
 use super::search::Search;
 use super::sites::Site;
@@ -45,6 +45,8 @@ const HOPELESS: f64 = 6.0;
 /// that is right to a pixel or two.
 const POLISH: Pass = Pass::new(EDGE_SD_PX, 4.0, 1.0, true);
 const POLISHED: f64 = 6.0;
+/// Belief from which on an object rests on the ground, or does not, without a second thought.
+const SURE: f64 = 0.98;
 /// A direction is left out when it takes more than this (rad or m) to move the contour that far: a
 /// turn about the axis of a solid of revolution.
 const BLIND: f64 = 0.2;
@@ -175,26 +177,28 @@ impl Search<'_> {
     /// The mean of some optima by belief, with the second moment about it of all by doubt.
     fn mixture(&self, optima: Vec<(Refined, Explained)>) -> (Refined, Explained) {
         // Which of the tops of the edges is as far away as the surface is, print knows.
-        let all = |(mut r, e): (Refined, Explained)| {
-            r.patches = self.patches(&r);
-            (e.evidence + print::evidence(&r.patches), r, e)
-        };
-        let mut optima: Vec<(f64, Refined, Explained)> = optima.into_iter().map(all).collect();
+        let seen: Vec<Vec<Patch>> = optima.iter().map(|o| self.patches(&o.0)).collect();
+        let told = print::supported(seen.iter().map(Vec::as_slice));
+        let all = optima.into_iter().zip(seen).zip(told);
+        let all = all.map(|(((mut refined, explained), patches), told)| {
+            refined.patches = patches;
+            let evidence = explained.evidence + print::evidence(&refined.patches) + told;
+            (evidence, refined, explained)
+        });
+        let mut optima: Vec<(f64, Refined, Explained)> = all.collect();
         optima.sort_by(|a, b| b.0.total_cmp(&a.0));
         let most = optima[0].0;
         optima.retain(|o| most - o.0 < MOST_BEHIND * DOUBT_NATS);
-        for (_, refined, _) in optima.iter_mut().filter(|o| most - o.0 < POLISHED) {
-            self.refine(refined, &[POLISH]);
-            // The print was looked for where the contour had the object: where both have it is better.
-            if !refined.patches.is_empty() {
-                refined.patches = self.patches(refined);
-                self.refine(refined, &[POLISH]);
+        for (evidence, refined, _) in &mut optima {
+            if most - *evidence < POLISHED {
+                self.polish(refined);
+            } else {
+                self.doubt(refined, &FINAL);
             }
         }
         let place = optima[0].1.pose;
         let (mut mean, mut beliefs) = (Vector6::zeros(), 0.0);
-        for (evidence, refined, _) in &mut optima {
-            self.doubt(refined, &FINAL);
+        for (evidence, refined, _) in &optima {
             let belief = (*evidence - most).exp();
             mean += difference(&place, &refined.pose) * belief;
             beliefs += belief;
@@ -209,5 +213,40 @@ impl Search<'_> {
         }
         let (_, top, explained) = optima.swap_remove(0);
         (Refined { pose, covariance: covariance / odds, ..top }, explained)
+    }
+
+    /// Refines a top by all there is to see, its covariance included. Where it is open whether the object
+    /// rests on the ground about it, it gets the mean of both.
+    fn polish(&self, top: &mut Refined) {
+        let mut lifted = top.clone();
+        lifted.patches.retain(|p| !p.on_ground());
+        self.doubt(&mut lifted, &FINAL);
+        let contact = print::contact(&top.patches, &lifted.covariance);
+        let finish = |refined: &mut Refined, on_ground: bool| {
+            self.refine(refined, &[POLISH]);
+            // The print was looked for where the contour had the object: where both have it is better.
+            if !refined.patches.is_empty() {
+                refined.patches = self.patches(refined);
+                refined.patches.retain(|p| on_ground || !p.on_ground());
+                self.refine(refined, &[POLISH]);
+            }
+            self.doubt(refined, &FINAL);
+        };
+        if contact < SURE {
+            finish(&mut lifted, false);
+        }
+        if contact > 1.0 - SURE {
+            finish(top, true);
+        } else {
+            *top = lifted;
+            return;
+        }
+        if contact < SURE {
+            let apart = difference(&top.pose, &lifted.pose);
+            top.pose = perturb(&top.pose, &(apart * (1.0 - contact)));
+            top.covariance = top.covariance * contact
+                + lifted.covariance * (1.0 - contact)
+                + apart * apart.transpose() * (contact * (1.0 - contact));
+        }
     }
 }

@@ -1,54 +1,104 @@
-//! Print on the object's surface that both views see.
+//! Print that both views see, on the object's surface and on what it rests on.
 //!
 //! **In:** a pose, the model, two prepared views. **Out:** [`Patch`]es: small squares of the first
-//! picture, carried over to the second by the surface that the pose puts there, and how far from that
-//! place the second picture shows the same print. An outline says how far away an object is by where
-//! it ends, which a rounded edge, a shadow or a lamp at one side move; print has no such faults, it is
-//! as far away as the surface that it is on. Which print it is nobody needs to know.
+//! picture, carried over to the second by the surface that the pose puts there ([`pair`]), and how far
+//! from that place the second picture shows the same print. An outline says how far away an object is by
+//! where it ends, which a rounded edge, a shadow or a lamp at one side move; print has no such faults, it
+//! is as far away as the surface that it is on. Which print it is nobody needs to know.
+//!
+//! An object that rests has the plane that it rests on in contact with it. The grain of a table top, its
+//! seams and the shadows on it show how high that plane is to a fraction of a millimetre, there is more
+//! of it than of the object, and it is there for plain objects too. How high the object is says how far
+//! away it is, as a camera looks down on it.
 //!
 //! Only the shift along the epipolar line is measured: it is what depth is in. The surface's curve
 //! within a square is followed to second order, without which a can seems to be millimetres further
 //! away than it is. A slope of brightness across the square belongs to lamp and shading, not to print,
 //! and is taken out of both; so is their contrast ([`square`]).
 
+mod pair;
 mod square;
 #[cfg(test)]
 mod tests;
 
 use std::ops::Range;
 
-use nalgebra::{Matrix2, Point2, Point3, RowVector2, Vector2, Vector3};
-use vergence_geometry::Transform;
+use nalgebra::{Matrix6, Point2, RowVector2, RowVector6};
+use std::f64::consts::PI;
 
 use super::equations::{Move, VIEWS};
 use super::level::Level;
 use super::refine::Refined;
-use super::search::{Search, Sight};
-use super::sites::{ByShared, FORM_AT, Site};
-use square::{HALF, Place, find, print_at};
+use super::search::Search;
+use super::sites::{ByShared, Site};
+use super::verdict::Explained;
+use pair::{Pair, pixel_of};
+use square::{HALF, Needs, find, print_at};
 
-/// Distance from square to square (px), times the working scale: large objects have enough of them.
-const STEP: usize = 2;
-/// Squares keep this far from the surface's border (px): edges of other surfaces blur into it.
-const MARGIN_PX: f64 = 0.5;
-/// Cosine to the line of sight from which on a surface is seen well enough.
-const FACING: f64 = 0.3;
-/// Around a landmark there is the tag's housing, which is higher than the surface (m).
-const HOUSING: f64 = 0.012;
-/// Where a surface comes nearer by a metre, its print must move by more than this (px).
-const LEAST_BY_SURFACE: f64 = 40.0;
+/// What the object rests on, as one of its surfaces.
+const GROUND: u16 = u16::MAX;
 
-/// Deviation of a whole surface from where the record has it (m): bulging sides, labels.
-pub(super) const SURFACE_SD: f64 = 0.0004;
-/// Deviation of where one view sees a surface's print from where the other does (px), and its degrees of
-/// freedom.
-pub(super) const PRINT_SD_PX: f64 = 0.06;
-pub(super) const PRINT_TAIL: f64 = 3.0;
-/// How many measurements a square is worth, as squares overlap, and the degrees of freedom of its shift.
-pub(super) const SQUARE_WORTH: f64 = 0.15;
+/// How squares are laid on a surface, and how well it is known before it is seen.
+pub(super) struct Trust {
+    /// Distance from square to square (px), times the working scale: large objects have enough of them.
+    step: usize,
+    /// Squares that there must be.
+    least: usize,
+    /// What a square needs to be found.
+    needs: Needs,
+    /// How many measurements a square is worth, as squares overlap.
+    pub worth: f64,
+    /// Deviation of the whole surface from where the record has it (m), and its degrees of freedom.
+    pub surface_sd: f64,
+    /// See `surface_sd`.
+    pub surface_tail: f64,
+    /// Deviation of its slopes against the object (rad).
+    pub slope_sd: f64,
+    /// Deviation of where one view sees its print from where the other does (px), with heavy tails.
+    pub between_sd_px: f64,
+}
+
+/// The object's surfaces: sides bulge, labels stand off. Fewer squares are a highlight, or the shadow of a
+/// handle.
+const OF_OBJECT: Trust = Trust {
+    step: 2,
+    least: 4,
+    needs: Needs { contrast: 2.0, correlation: 0.8 },
+    worth: 0.15,
+    surface_sd: 0.0004,
+    surface_tail: f64::INFINITY,
+    slope_sd: 0.0,
+    between_sd_px: 0.06,
+};
+/// What the object rests on: feet and bent bottoms lift it a little, a coaster or a hand by more. It is
+/// large, and its squares may each say little.
+const OF_GROUND: Trust = Trust {
+    step: 4,
+    least: 16,
+    needs: Needs { contrast: 1.5, correlation: 0.65 },
+    worth: 0.5,
+    surface_sd: 0.0004,
+    surface_tail: 1.0,
+    slope_sd: 0.003,
+    between_sd_px: 0.03,
+};
+
+/// Degrees of freedom of what the views differ by about a surface, and of a square's shift.
+pub(super) const BETWEEN_TAIL: f64 = 3.0;
 pub(super) const SQUARE_TAIL: f64 = 3.0;
-/// Squares that a surface must have: fewer are a highlight, or the shadow of a handle.
-const LEAST_SQUARES: usize = 4;
+
+/// Squares of the ground that are further than this from the middle one's level (px) are on other things.
+const LEVEL_PX: f64 = 0.3;
+/// Poses that are less behind than this (nats) are told apart by what they rest on.
+const RIVALS: f64 = 12.0;
+/// Chance that an object rests on something else than the plane about it that both views see, and the
+/// power with which fewer squares speak against a plane: by chance, some are found in a wrong one.
+const ELSEWHERE: f64 = 0.03;
+const FEWER: f64 = 3.0;
+/// Gaps between an object and that plane where it does not rest on it are spread over so much (m), and the
+/// share of the variance that edges claim that is the core of what they are off by: the rest is for tails.
+const GAPS: f64 = 0.02;
+const CORE: f64 = 0.15;
 
 /// A square of print seen by both views.
 #[derive(Debug, Clone, PartialEq)]
@@ -65,22 +115,23 @@ pub struct Patch {
     pub by_surface: f64,
     /// Shift by the shared unknowns (px per unit).
     pub by_shared: ByShared,
+    /// Shift by slopes of what the object rests on against the object, in two directions (px per rad).
+    pub by_slope: RowVector2<f64>,
     /// Shift by small turns of each camera about its own x and y axes (px per rad).
     pub by_turn: [RowVector2<f64>; VIEWS],
 }
 
-/// A point of the object that the first view sees.
-#[derive(Clone, Copy)]
-struct Seen {
-    /// Where it is (object frame).
-    p: Vector3<f64>,
-    /// The surface's number.
-    part: u16,
-    /// Its outward unit normal there (object frame).
-    normal: Vector3<f64>,
-}
-
 impl Patch {
+    /// It is on what the object rests on.
+    pub fn on_ground(&self) -> bool {
+        self.part == GROUND
+    }
+
+    /// How well its surface is known.
+    pub(super) fn trust(&self) -> &'static Trust {
+        if self.on_ground() { &OF_GROUND } else { &OF_OBJECT }
+    }
+
     /// What is left of the residual (px) when the unknowns have moved.
     pub(super) fn left(&self, moved: &Move) -> f64 {
         let turns = self.by_turn.iter().zip(&moved.own).map(|(by, turn)| (by * turn).x);
@@ -89,180 +140,151 @@ impl Patch {
 }
 
 impl Search<'_> {
-    /// The squares of print that both views show of a refined object.
+    /// The squares of print that both views show of a refined object and of what it rests on.
     pub(super) fn patches(&self, refined: &Refined) -> Vec<Patch> {
-        let [first, second] = self.sights else { return Vec::new() };
-        let level = &first.fine;
-        let pair = Pair::new(self, refined, [first, second]);
-        let step = STEP * first.coarse.scale;
-        let [columns, rows] = extent(&refined.sites, level);
-        let mut out = Vec::new();
-        for y in rows.step_by(step) {
-            for x in columns.clone().step_by(step) {
-                let Some(middle) = pair.surface(pixel_of(level, x, y)) else { continue };
-                let Some(here) = print_at(level, x, y) else { continue };
-                let Some((place, by_surface)) = pair.carry_over(x, y, middle) else { continue };
-                let Some(found) = find(&here, level, &second.fine, &place) else { continue };
-                out.push(Patch {
-                    pixel: pixel_of(level, x, y).into(),
-                    part: middle.part,
-                    residual: found.shift,
-                    noise_px: found.noise_px,
-                    by_surface,
-                    by_shared: pair.by_shared(&middle) * by_surface,
-                    by_turn: place.by_turn.map(|by| found.along.transpose() * by),
-                });
-            }
+        let Some(pair) = Pair::new(self, refined) else { return Vec::new() };
+        let within = extent(&refined.sites, &pair.sights[0].fine);
+        let mut out = squares(&pair, within, false);
+        out.extend(self.ground(&pair));
+        out
+    }
+
+    /// The squares of what a refined object rests on.
+    fn ground(&self, pair: &Pair) -> Vec<Patch> {
+        if !pair.rests() {
+            return Vec::new();
         }
-        out.sort_by_key(|p: &Patch| p.part);
-        let surfaces = out.chunk_by(|a, b| a.part == b.part);
-        surfaces.filter(|squares| squares.len() >= LEAST_SQUARES).flatten().cloned().collect()
+        squares(pair, whole(&pair.sights[0].fine), true)
+    }
+
+    /// Of poses that differ, best first, those that do not rest where the ground is lose evidence: a box on
+    /// another side would have its landmark at another height. Best first again.
+    pub(super) fn heed_ground(&self, different: &mut [(Refined, Explained)]) {
+        let Some(best) = different.first().map(|d| d.1.evidence) else { return };
+        let rivals = different.iter().filter(|d| best - d.1.evidence < RIVALS).count();
+        if rivals < 2 {
+            return;
+        }
+        let seen = |(refined, _): &(Refined, Explained)| {
+            Pair::new(self, refined).map_or_else(Vec::new, |pair| self.ground(&pair))
+        };
+        let seen: Vec<Vec<Patch>> = different[..rivals].iter().map(seen).collect();
+        let told = supported(seen.iter().map(Vec::as_slice));
+        different.iter_mut().zip(told).for_each(|(d, told)| d.1.evidence += told);
+        different.sort_by(|a, b| b.1.evidence.total_cmp(&a.1.evidence));
     }
 }
 
-/// What print says for the pose that it was found with (nats), the more the more of it both views see
-/// on the object's surfaces and the nearer it is to where it should be. A surface that has it elsewhere
-/// says nothing: it may be gloss.
+/// Squares all over a part of the first view, of the ground or of everything else.
+fn squares(pair: &Pair, [columns, rows]: [Range<usize>; 2], ground: bool) -> Vec<Patch> {
+    let trust = if ground { &OF_GROUND } else { &OF_OBJECT };
+    let [first, second] = pair.sights.map(|s| &s.fine);
+    let step = trust.step * pair.sights[0].coarse.scale;
+    let mut out: Vec<Patch> = Vec::new();
+    for y in rows.step_by(step) {
+        for x in columns.clone().step_by(step) {
+            let Some(here) = print_at(first, x, y, &trust.needs) else { continue };
+            let Some(middle) = pair.surface(pixel_of(first, x, y)) else { continue };
+            if (middle.part == GROUND) != ground {
+                continue;
+            }
+            let Some((place, by_surface)) = pair.carry_over(x, y, middle) else { continue };
+            let Some(found) = find(&here, first, second, &place, &trust.needs) else { continue };
+            out.push(Patch {
+                pixel: pixel_of(first, x, y).into(),
+                part: middle.part,
+                residual: found.shift,
+                noise_px: found.noise_px,
+                by_surface,
+                by_shared: pair.by_shared(&middle) * by_surface,
+                by_slope: pair.by_slope(&middle) * by_surface,
+                by_turn: place.by_turn.map(|by| found.along.transpose() * by),
+            });
+        }
+    }
+    if ground {
+        keep_level(&mut out);
+    }
+    out.sort_by_key(|p| p.part);
+    let surfaces = out.chunk_by(|a, b| a.part == b.part);
+    surfaces.filter(|squares| squares.len() >= trust.least).flatten().cloned().collect()
+}
+
+/// Keeps the squares that are on one level with most; none where there is no such level.
+fn keep_level(squares: &mut Vec<Patch>) {
+    let height = |p: &Patch| p.residual / p.by_surface;
+    squares.sort_by(|a, b| height(a).total_cmp(&height(b)));
+    let Some(middle) = squares.get(squares.len() / 2).map(height) else { return };
+    let all = squares.len();
+    squares.retain(|p| (p.residual - middle * p.by_surface).abs() < LEVEL_PX);
+    if 2 * squares.len() < all {
+        squares.clear();
+    }
+}
+
+/// What print on the object says for the pose that it was found with (nats), the more the more of it both
+/// views see and the nearer it is to where it should be. A surface that has it elsewhere says nothing: it
+/// may be gloss.
 pub(super) fn evidence(patches: &[Patch]) -> f64 {
-    let of_surface = |squares: &[Patch]| {
-        let (mut weight, mut shift, mut by_surface) = (0.0, 0.0, 0.0);
-        for patch in squares {
-            let w = SQUARE_WORTH / (patch.noise_px * patch.noise_px);
-            weight += w;
-            shift += w * patch.residual;
-            by_surface += w * patch.by_surface;
-        }
-        let (shift, by_surface) = (shift / weight, by_surface / weight);
-        let variance =
-            PRINT_SD_PX * PRINT_SD_PX + (SURFACE_SD * by_surface).powi(2) + weight.recip();
-        let off = 0.5 * (PRINT_TAIL + 1.0) * (shift * shift / (PRINT_TAIL * variance)).ln_1p();
-        (SQUARE_WORTH * squares.len() as f64 - off).max(0.0)
+    let surfaces = patches.chunk_by(|a, b| a.part == b.part).filter(|s| !s[0].on_ground());
+    surfaces.map(|s| (OF_OBJECT.worth * s.len() as f64 - off(s)).max(0.0)).sum()
+}
+
+/// What speaks against each of some poses (nats, at most zero) as the ground does not seem to be where the
+/// object would rest. That there is a plane says nothing for the object.
+pub(super) fn supported<'a>(poses: impl Iterator<Item = &'a [Patch]>) -> Vec<f64> {
+    let found = |patches: &[Patch]| {
+        let on_ground = patches.chunk_by(|a, b| a.part == b.part).find(|s| s[0].on_ground());
+        on_ground.map_or(0.0, |s| s.len() as f64 * (-off(s) / FEWER).exp())
     };
-    patches.chunk_by(|a, b| a.part == b.part).map(of_surface).sum()
+    let found: Vec<f64> = poses.map(found).collect();
+    let most = found.iter().copied().fold(0.0, f64::max);
+    if most == 0.0 {
+        return vec![0.0; found.len()];
+    }
+    let against = |f: f64| (ELSEWHERE + (1.0 - ELSEWHERE) * (f / most).powf(FEWER)).ln();
+    found.into_iter().map(against).collect()
 }
 
-/// Two views of an object in a pose.
-struct Pair<'a> {
-    search: &'a Search<'a>,
-    sights: [&'a Sight<'a>; VIEWS],
-    pose: Transform,
-    size: f64,
-    /// `optical_from_object` of either view.
-    from_object: [Transform; VIEWS],
-    object_from_first: Transform,
-    /// The views' eyes in the object frame.
-    eyes: [Vector3<f64>; VIEWS],
-    /// Where the first picture shows the tag's lights, and how far around there may be its housing (px).
-    tags: Vec<(Vector2<f64>, f64)>,
+/// Belief that the object rests on the ground that it was found with, where its edges alone leave it with
+/// this covariance: a gap of millimetres is a coaster or a hand, one that the edges cannot tell from none
+/// is none.
+pub(super) fn contact(patches: &[Patch], covariance: &Matrix6<f64>) -> f64 {
+    let mut surfaces = patches.chunk_by(|a, b| a.part == b.part);
+    let Some(squares) = surfaces.find(|s| s[0].on_ground()) else { return 0.0 };
+    let (shift, by_surface, _) = mean(squares);
+    let gap = shift / by_surface;
+    let by_pose = squares.iter().map(|p| p.by_shared.fixed_columns::<6>(0) / p.by_surface);
+    let by_pose = by_pose.sum::<RowVector6<f64>>() / squares.len() as f64;
+    let edges = (by_pose * covariance * by_pose.transpose()).x;
+    let variance = CORE * edges + OF_GROUND.surface_sd.powi(2);
+    let contact = (-0.5 * gap * gap / variance).exp() / (2.0 * PI * variance).sqrt();
+    let odds = contact * (1.0 - ELSEWHERE) / (ELSEWHERE / GAPS);
+    odds / (1.0 + odds)
 }
 
-impl<'a> Pair<'a> {
-    fn new(search: &'a Search, refined: &Refined, sights: [&'a Sight; VIEWS]) -> Self {
-        let from_object = std::array::from_fn(|v| {
-            let turned = Transform::rotation(refined.turns[v].push(0.0));
-            turned * sights[v].optical_from_base * refined.pose
-        });
-        let [object_from_first, object_from_second] = from_object.map(|t: Transform| t.inverse());
-        let eyes = [object_from_first, object_from_second].map(|t| t.translation.vector);
-        let (pose, size) = (refined.pose, refined.form.x.exp());
-        let camera = &sights[0].view.camera;
-        let landmarks = search.query.record.landmarks.iter();
-        let tags = landmarks.filter_map(|l| {
-            let p = from_object[0] * Point3::from(Vector3::from(l.position) * size);
-            Some((camera.project(&p)?.coords, HOUSING * camera.fx / p.z))
-        });
-        let tags = tags.collect();
-        Pair { search, sights, pose, size, from_object, object_from_first, eyes, tags }
+/// Mean shift of a surface's squares (px), mean shift by the surface (px per m), and the first's information
+/// (1/px^2).
+fn mean(squares: &[Patch]) -> (f64, f64, f64) {
+    let (mut weight, mut shift, mut by_surface) = (0.0, 0.0, 0.0);
+    for patch in squares {
+        let w = patch.trust().worth / (patch.noise_px * patch.noise_px);
+        weight += w;
+        shift += w * patch.residual;
+        by_surface += w * patch.by_surface;
     }
+    (shift / weight, by_surface / weight, weight)
+}
 
-    /// The point that a pixel of the first picture shows.
-    fn surface(&self, pixel: Vector2<f64>) -> Option<Seen> {
-        let ray =
-            self.object_from_first.rotation * self.sights[0].view.camera.unproject(&pixel.into());
-        let eye = self.eyes[0] / self.size;
-        let hit = self.search.model.first_hit(&eye, &ray)?;
-        let seen = hit.normal.dot(&ray) < -FACING;
-        let p = (eye + ray * hit.distance) * self.size;
-        seen.then_some(Seen { p, part: hit.part, normal: hit.normal })
-    }
-
-    /// Where the square about a pixel of the first level is in the second, and its shift along the epipolar
-    /// line by the surface along its own normal (px per m).
-    fn carry_over(&self, x: usize, y: usize, seen: Seen) -> Option<(Place, f64)> {
-        let Seen { p, part, normal } = seen;
-        let [first, second] = self.sights;
-        let pixel = pixel_of(&first.fine, x, y);
-        let to_second = (self.eyes[1] - p).normalize();
-        if normal.dot(&to_second) < FACING {
-            return None;
-        }
-        let half = HALF as f64;
-        let corner = half + MARGIN_PX;
-        let beside_tag = |(tag, radius): &(Vector2<f64>, f64)| {
-            (tag - pixel).map(|d| (d.abs() - half).max(0.0)).norm() < *radius
-        };
-        if self.tags.iter().any(beside_tag) {
-            return None;
-        }
-        for (dx, dy) in [(-corner, -corner), (corner, -corner), (corner, corner), (-corner, corner)]
-        {
-            if self.surface(pixel + Vector2::new(dx, dy))?.part != part {
-                return None;
-            }
-        }
-        let project = |p: &Vector3<f64>| {
-            let q = self.from_object[1] * Point3::from(*p);
-            second.view.camera.project_with_jacobian(&q).map(|(pixel, by)| (pixel.coords, q, by))
-        };
-        let (there, q, by_point) = project(&p)?;
-        let beside =
-            |dx: f64, dy: f64| Some(project(&self.surface(pixel + Vector2::new(dx, dy))?.p)?.0);
-        let [left, right] = [beside(-half, 0.0)?, beside(half, 0.0)?];
-        let [above, below] = [beside(0.0, -half)?, beside(0.0, half)?];
-        let slope = |a: Vector2<f64>, b: Vector2<f64>| (b - a) / (2.0 * half);
-        let bend = |a: Vector2<f64>, b: Vector2<f64>| (a + b - there * 2.0) / (2.0 * half * half);
-        // Along the first view's ray: the epipolar line.
-        let ray = (p - self.eyes[0]).normalize();
-        let by_object = by_point * self.from_object[1].rotation.to_rotation_matrix().into_inner();
-        let along: Vector2<f64> = by_object * ray / normal.dot(&ray);
-        let by_surface = along.norm();
-        if by_surface < LEAST_BY_SURFACE {
-            return None;
-        }
-        let epipolar = along / by_surface;
-        let (u, v) = second.fine.from_picture(there.x, there.y);
-        // A turned first camera casts its ray elsewhere onto the surface.
-        let distance = (p - self.eyes[0]).norm();
-        let in_first = self.from_object[0].rotation * ray;
-        let by_first = |axis: Vector3<f64>| {
-            let turned = self.object_from_first.rotation * in_first.cross(&axis);
-            let moved = turned - ray * (normal.dot(&turned) / normal.dot(&ray));
-            by_object * moved * distance
-        };
-        let by_second = |axis: Vector3<f64>| by_point * axis.cross(&q.coords);
-        let place = Place {
-            middle: (x, y),
-            there: Vector2::new(u, v),
-            affine: Matrix2::from_columns(&[slope(left, right), slope(above, below)]),
-            bend: [bend(left, right), bend(above, below)],
-            epipolar,
-            by_turn: [
-                Matrix2::from_columns(&[Vector3::x(), Vector3::y()].map(by_first)),
-                Matrix2::from_columns(&[Vector3::x(), Vector3::y()].map(by_second)),
-            ],
-        };
-        Some((place, by_surface))
-    }
-
-    /// How far a point moves along its surface's normal (m) by the shared unknowns.
-    fn by_shared(&self, at: &Seen) -> ByShared {
-        let (lever, out) = (self.pose.rotation * at.p, self.pose.rotation * at.normal);
-        let mut by_shared = ByShared::zeros();
-        by_shared.fixed_columns_mut::<3>(0).copy_from(&lever.cross(&out).transpose());
-        by_shared.fixed_columns_mut::<3>(3).copy_from(&out.transpose());
-        by_shared[FORM_AT] = out.dot(&lever);
-        by_shared
-    }
+/// How much less likely it is (nats) that a surface is where its squares are than where it should be.
+fn off(squares: &[Patch]) -> f64 {
+    let trust = squares[0].trust();
+    let (shift, by_surface, weight) = mean(squares);
+    let variance = trust.between_sd_px * trust.between_sd_px
+        + (trust.surface_sd * by_surface).powi(2)
+        + weight.recip();
+    let tail = trust.surface_tail.min(BETWEEN_TAIL);
+    0.5 * (tail + 1.0) * (shift * shift / (tail * variance)).ln_1p()
 }
 
 /// Columns and rows of the first view's level in which squares may have their middles: those of the
@@ -284,7 +306,7 @@ fn extent(sites: &[Site], level: &Level) -> [Range<usize>; 2] {
     ]
 }
 
-/// Picture pixel of a pixel of a level at full resolution.
-fn pixel_of(level: &Level, x: usize, y: usize) -> Vector2<f64> {
-    Vector2::new((x + level.origin.0) as f64, (y + level.origin.1) as f64)
+/// All columns and rows that whole squares and their slopes have room for.
+fn whole(level: &Level) -> [Range<usize>; 2] {
+    [level.width(), level.height()].map(|size| HALF + 1..size.saturating_sub(HALF + 1))
 }

@@ -282,6 +282,15 @@ impl Search<'_> {
     fn tilt(&self, state: &Refined) -> Option<(Vector3<f64>, Matrix3<f64>)> {
         let up = self.query.up?.into_inner();
         let turn = state.pose.rotation.to_rotation_matrix();
+        let rest = self.rest(state)?;
+        let nearest = turn * -rest.down;
+        Some((nearest.cross(&up), turn * rest.held * turn.inverse()))
+    }
+
+    /// How the object rests in a state, when it seems to.
+    pub(super) fn rest(&self, state: &Refined) -> Option<Rest> {
+        let up = self.query.up?.into_inner();
+        let turn = state.pose.rotation.to_rotation_matrix();
         let rest = match self.query.standing {
             Some(false) => return None,
             Some(true) => Rest::on(-Vector3::z()),
@@ -291,7 +300,7 @@ impl Search<'_> {
         let tilt = nearest.cross(&up);
         let rests = nearest.dot(&up) > 0.0
             && (tilt.norm() < STANDING_LIMIT || state.rests || self.query.standing == Some(true));
-        rests.then(|| (tilt, turn * rest.held * turn.inverse()))
+        rests.then_some(rest)
     }
 }
 

@@ -14,23 +14,28 @@ pub const HALF: usize = 3;
 const SIDE: usize = 2 * HALF + 1;
 const PIXELS: usize = SIDE * SIDE;
 const LANES: usize = 8;
-/// A square needs this many noise deviations of contrast (root mean square).
-const CONTRAST: f32 = 2.0;
 /// Rounds of the shift's refinement, and how far it may go (px): repeated print is further apart.
 const ROUNDS: usize = 4;
 const REACH_PX: f64 = 2.0;
 /// A round that moves by less than this (px) is the last.
 const STILL_PX: f64 = 0.01;
-/// Correlation of the two squares that is needed, on the way and at last, and contrast of the second
-/// against the first.
+/// Correlation of the two squares that is needed on the way, and contrast of the second against the
+/// first.
 const LEAST_CORRELATION: f32 = 0.3;
-const CORRELATION: f32 = 0.8;
 const LEAST_GAIN: f32 = 0.5;
 /// Squares whose shift is known worse than this (px) are left out; none is known better than that.
 const MOST_NOISE_PX: f64 = 0.3;
 const LEAST_NOISE_PX: f64 = 0.07;
 /// Deviation across the epipolar line of where the second picture shows a square (px): lenses.
 const ACROSS_SD_PX: f64 = 0.05;
+
+/// What a square needs to be found.
+pub struct Needs {
+    /// Contrast in the first picture (root mean square), in deviations of the noise.
+    pub contrast: f32,
+    /// Correlation with what the second picture has there.
+    pub correlation: f32,
+}
 
 /// A square on the surface, and where the second view should see it.
 pub struct Place {
@@ -65,9 +70,9 @@ pub type Square = SMatrix<f32, LANES, SIDE>;
 
 /// The square about a pixel that is far enough from the border, without its mean and its slopes; `None`
 /// where there is little to see.
-pub fn print_at(level: &Level, x: usize, y: usize) -> Option<Square> {
+pub fn print_at(level: &Level, x: usize, y: usize, needs: &Needs) -> Option<Square> {
     let flat = flattened(&square(level, x, y));
-    let least = CONTRAST * level.step_noise * (PIXELS as f32).sqrt();
+    let least = needs.contrast * level.step_noise * (PIXELS as f32).sqrt();
     (flat.norm() >= least).then_some(flat)
 }
 
@@ -117,7 +122,13 @@ fn flattened(square: &Square) -> Square {
 
 /// Where the second picture shows a square: Gauss-Newton on shift and contrast, the slopes being the first
 /// picture's.
-pub fn find(here: &Square, first: &Level, second: &Level, place: &Place) -> Option<Found> {
+pub fn find(
+    here: &Square,
+    first: &Level,
+    second: &Level,
+    place: &Place,
+    needs: &Needs,
+) -> Option<Found> {
     // A step in the second picture is this step in the first.
     let back = place.affine.try_inverse()?;
     let (x, y) = place.middle;
@@ -163,7 +174,7 @@ pub fn find(here: &Square, first: &Level, second: &Level, place: &Place) -> Opti
     let noise_px = noise_px.hypot(slant * ACROSS_SD_PX).max(LEAST_NOISE_PX);
     let along = place.epipolar + across * slant;
     let found = Found { shift, noise_px, along };
-    (correlation > CORRELATION && noise_px < MOST_NOISE_PX).then_some(found)
+    (correlation > needs.correlation && noise_px < MOST_NOISE_PX).then_some(found)
 }
 
 /// The second picture where the square's pixels are in it, shifted along the epipolar line; `None` when

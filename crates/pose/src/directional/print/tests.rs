@@ -2,16 +2,18 @@
 
 use std::f64::consts::FRAC_PI_2;
 
-use nalgebra::{Matrix3, UnitQuaternion, Vector6};
+use nalgebra::{Matrix2, Matrix3, Point3, UnitQuaternion, Vector2, Vector3, Vector6};
 use vergence_geometry::gaussian::perturb;
-use vergence_geometry::{Camera, GaussianPoint};
+use vergence_geometry::{Camera, GaussianPoint, Transform};
 use vergence_imaging::Image;
 use vergence_tag::Record;
 
+use super::square::Place;
 use super::*;
 use crate::directional::equations::Move;
 use crate::directional::level::{Reduced, Region};
 use crate::directional::refine::{FINAL, STEPS};
+use crate::directional::sites::FORM_AT;
 use crate::directional::{Config, prepare};
 use crate::model::Model;
 use crate::types::{Query, View};
@@ -49,18 +51,42 @@ fn pose() -> Transform {
     Transform::from_parts(Vector3::new(0.75, 0.01, 0.05).into(), turn)
 }
 
-/// Print everywhere on the surface, under a lamp at one side; the background is dark.
-fn picture(model: &Model, (camera, base_from_optical): &(Camera, Transform)) -> Image<u8> {
+/// What there is to see beside the object's form.
+#[derive(Clone, Copy)]
+struct Scene {
+    /// The object has print.
+    printed: bool,
+    /// Below it there is a table with grain, this far from it (m).
+    table: Option<f64>,
+    /// What is known of how it rests.
+    standing: Option<bool>,
+}
+
+const PRINTED: Scene = Scene { printed: true, table: None, standing: Some(true) };
+/// A plain object on a table.
+const PLAIN: Scene = Scene { printed: false, table: Some(0.0), ..PRINTED };
+
+/// The object under a lamp at one side; the background is dark.
+fn picture(
+    model: &Model,
+    (camera, base_from_optical): &(Camera, Transform),
+    scene: Scene,
+) -> Image<u8> {
     let object_from_optical = pose().inverse() * base_from_optical;
     let eye = object_from_optical.translation.vector;
     let lamp = Vector3::new(-0.6, 0.5, 0.6).normalize();
     const RAYS: usize = 4;
     let level = |x: f64, y: f64| {
         let ray = object_from_optical.rotation * camera.unproject(&Point2::new(x, y));
-        let Some(hit) = model.first_hit(&eye, &ray) else { return 20.0 };
+        let Some(hit) = model.first_hit(&eye, &ray) else {
+            let Some(gap) = scene.table.filter(|_| ray.z < -0.05) else { return 20.0 };
+            let p = (eye + ray * ((eye.z + gap + model.reach(&-Vector3::z())) / -ray.z)) * 1e3;
+            return 90.0 + 20.0 * (p.x / 4.3 + (p.y / 9.0).sin()).sin() + 20.0 * (p.y / 5.2).sin();
+        };
         let p = (eye + ray * hit.distance) * 1e3;
         let print = (p.x / 4.1).sin() * (p.y / 3.3 + 0.4).sin() + (p.z / 3.7 + p.x / 6.1).sin();
-        (110.0 + 35.0 * print) * (0.5 + 0.5 * hit.normal.dot(&lamp).max(0.0))
+        let print = if scene.printed { 35.0 * print } else { 0.0 };
+        (110.0 + print) * (0.5 + 0.5 * hit.normal.dot(&lamp).max(0.0))
     };
     Image::from_fn(camera.width, camera.height, |x, y| {
         let part = |k: usize| (k as f64 + 0.5) / RAYS as f64 - 0.5;
@@ -73,19 +99,19 @@ fn picture(model: &Model, (camera, base_from_optical): &(Camera, Transform)) -> 
 /// The landmark is measured this much too far away (m).
 const TOO_FAR: Vector3<f64> = Vector3::new(0.003, 0.0, 0.0);
 
-/// Calls back with a search on the pictures of a body.
+/// Calls back with a search on the pictures of a printed body.
 fn with(body: &str, check: impl Fn(&Search)) {
-    with_turned(body, Default::default(), check);
+    with_all(body, PRINTED, Default::default(), check);
 }
 
-/// The same when the cameras were turned a little more than told.
-fn with_turned(body: &str, turns: [Vector2<f64>; 2], check: impl Fn(&Search)) {
+/// The same of some scene, whose cameras were turned a little more than told.
+fn with_all(body: &str, scene: Scene, turns: [Vector2<f64>; 2], check: impl Fn(&Search)) {
     let record = record(body);
     let model = Model::new(&record);
     let cameras = cameras();
     let images = [0, 1].map(|v| {
         let turned = Transform::rotation(turns[v].push(0.0));
-        picture(&model, &(cameras[v].0, cameras[v].1 * turned.inverse()))
+        picture(&model, &(cameras[v].0, cameras[v].1 * turned.inverse()), scene)
     });
     let views = [0, 1].map(|v| View {
         image: &images[v],
@@ -98,7 +124,7 @@ fn with_turned(body: &str, turns: [Vector2<f64>; 2], check: impl Fn(&Search)) {
         position: pose() * Point3::from(on_body) + TOO_FAR,
         covariance: Matrix3::identity() * 1e-5,
     };
-    let (up, standing) = (Some(Vector3::z_axis()), Some(true));
+    let (up, standing) = (Some(Vector3::z_axis()), scene.standing);
     let query = Query { record: &record, landmark, landmark_index: 0, up, standing };
     let config = Config::default();
     let sights = prepare(&views, &query, on_body, &config, false);
@@ -171,27 +197,31 @@ fn print_alone_brings_surfaces_back() {
 
 #[test]
 fn the_second_view_sees_a_point_move_by_the_derivatives() {
-    for body in BODIES {
-        with(body, |search| {
-            let [first, second] = search.sights else { panic!("two views") };
-            let level = &first.fine;
+    // Standing, and lying on a side, on which some can roll.
+    let lying = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), FRAC_PI_2);
+    let lying = Transform::from_parts(pose().translation, lying * pose().rotation);
+    let rests = [(Some(true), pose()), (None, lying)];
+    for (body, (standing, place)) in BODIES.iter().flat_map(|b| rests.map(|r| (b, r))) {
+        with_all(body, Scene { standing, ..PRINTED }, Default::default(), |search| {
+            let level = &search.sights[0].fine;
             let at = |refined: &Refined, x: usize, y: usize| {
-                let pair = Pair::new(search, refined, [first, second]);
+                let pair = Pair::new(search, refined)?;
                 let middle = pair.surface(pixel_of(level, x, y))?;
                 let (place, by_surface) = pair.carry_over(x, y, middle)?;
-                Some((place, pair.by_shared(&middle) * by_surface))
+                let on_ground = middle.part == GROUND;
+                Some((place, pair.by_shared(&middle) * by_surface, on_ground))
             };
-            let still = Refined::new(&pose(), false);
-            let mut checked = 0;
-            let spread = |k: usize, size: usize| size / 3 + k * size / 30;
+            let still = Refined::new(&place, true);
+            let mut checked = [0, 0];
+            let spread = |k: usize, size: usize| size / 10 + k * size * 8 / 100;
             let (width, height) = (level.width(), level.height());
             for (x, y) in (0..100).map(|k| (spread(k % 10, width), spread(k / 10, height))) {
-                let Some((place, by_shared)) = at(&still, x, y) else { continue };
+                let Some((place, by_shared, on_ground)) = at(&still, x, y) else { continue };
                 const STEP: f64 = 1e-5;
                 let derivative = |change: &dyn Fn(&mut Refined)| {
                     let mut moved = still.clone();
                     change(&mut moved);
-                    let (there, _) = at(&moved, x, y)?;
+                    let (there, ..) = at(&moved, x, y)?;
                     Some((there.there - place.there).dot(&place.epipolar) / STEP)
                 };
                 let by_pose = (0..6).map(|k| {
@@ -208,10 +238,10 @@ fn the_second_view_sees_a_point_move_by_the_derivatives() {
                     let Some(by) = by else { continue };
                     let close = (by - told).abs() < 0.01 * told.abs() + 0.5;
                     assert!(close, "unknown {k} at ({x}, {y}): {by:.2}, told {told:.2}, {body}");
-                    checked += 1;
+                    checked[usize::from(on_ground)] += 1;
                 }
             }
-            assert!(checked > 100, "{checked} of {body}");
+            assert!(checked.iter().all(|&n| n > 25), "{checked:?} of {body}");
         });
     }
 }
@@ -221,7 +251,7 @@ fn cameras_that_are_turned_shift_print_as_the_derivatives_say() {
     // Up to a fifth of a pixel, along and across the epipolar line.
     let turns = [Vector2::new(3e-4, -2e-4), Vector2::new(-2e-4, 3e-4)];
     for body in BODIES {
-        with_turned(body, turns, |search| {
+        with_all(body, PRINTED, turns, |search| {
             let patches = seen(search, &Vector6::zeros());
             let predicted = |p: &Patch| {
                 p.by_turn.iter().zip(&turns).map(|(by, turn)| (by * turn).x).sum::<f64>()
@@ -242,6 +272,7 @@ fn what_is_far_off_and_what_is_little_says_nothing() {
         noise_px: 0.1,
         by_surface: 100.0,
         by_shared: ByShared::zeros(),
+        by_slope: Default::default(),
         by_turn: Default::default(),
     };
     let squares = |n: usize, residual: f64| vec![Patch { residual, ..patch.clone() }; n];
@@ -266,9 +297,10 @@ fn level(grey: impl Fn(f64, f64) -> f64) -> (Level, (usize, usize)) {
 
 #[test]
 fn a_lamp_that_lights_one_view_from_the_side_does_not_move_print() {
+    const NEEDS: Needs = OF_OBJECT.needs;
     let print = |x: f64, y: f64| 110.0 + 25.0 * (x / 1.9).sin() * (y / 2.3 + 0.5).cos();
     let (first, middle) = level(print);
-    let here = square::print_at(&first, middle.0, middle.1).unwrap();
+    let here = square::print_at(&first, middle.0, middle.1, &NEEDS).unwrap();
     for shift in [-0.4, 0.0, 0.3] {
         let moved = |x: f64, y: f64| print(x - shift, y);
         let (second, there) = level(|x, y| 0.8 * moved(x, y) + 2.0 * (x - 32.0) - 1.5 * (y - 32.0));
@@ -280,7 +312,78 @@ fn a_lamp_that_lights_one_view_from_the_side_does_not_move_print() {
             epipolar: Vector2::x(),
             by_turn: Default::default(),
         };
-        let found = square::find(&here, &first, &second, &place).unwrap();
+        let found = square::find(&here, &first, &second, &place, &NEEDS).unwrap();
         assert!((found.shift - shift).abs() < 0.05, "{:.3}, it is {shift}", found.shift);
     }
+}
+
+#[test]
+fn a_table_below_a_plain_object_is_where_the_true_pose_puts_it() {
+    for body in BODIES {
+        with_all(body, PLAIN, Default::default(), |search| {
+            let patches = seen(search, &Vector6::zeros());
+            let on_object = patches.iter().filter(|p| !p.on_ground()).count();
+            assert!(
+                patches.len() > 50 && on_object == 0,
+                "{on_object} of {}, {body}",
+                patches.len()
+            );
+            let off = mean(&patches, |p| p.residual);
+            assert!(off.abs() < 0.02, "{off:.3} px, {} squares of {body}", patches.len());
+        });
+    }
+}
+
+#[test]
+fn how_high_the_table_is_says_how_far_away_a_plain_object_is() {
+    for body in BODIES {
+        with_all(body, PLAIN, Default::default(), |search| {
+            // Along the line of sight, as edges hardly notice: further away and lower.
+            let sight = pose().translation.vector - Vector3::new(0.0, 0.0, 0.3);
+            let off = sight.normalize() * 0.004;
+            let mut refined = Refined::new(
+                &perturb(&pose(), &Vector6::new(0.0, 0.0, 0.0, off.x, off.y, off.z)),
+                false,
+            );
+            let height = |r: &Refined| r.pose.translation.vector.z - pose().translation.vector.z;
+            let before = height(&refined);
+            for _ in 0..3 {
+                refined.patches = search.patches(&refined);
+                let mut moved = Move::default();
+                (0..STEPS).for_each(|_| search.advance(&mut refined, &[], 0.2, &mut moved));
+                refined.apply(&moved);
+            }
+            let after = height(&refined);
+            assert!(after.abs() < 0.35 * before.abs(), "{before:.5} {after:.5} m, {body}");
+        });
+    }
+}
+
+#[test]
+fn an_object_that_stands_on_something_else_is_not_drawn_to_the_table() {
+    // What edges leave: half a millimetre upwards.
+    let edges = Matrix6::identity() * 2.5e-7;
+    for (gap, rests) in [(0.0, true), (0.0003, true), (0.005, false), (0.1, false)] {
+        let scene = Scene { table: Some(gap), ..PLAIN };
+        for body in BODIES {
+            with_all(body, scene, Default::default(), |search| {
+                let patches = seen(search, &Vector6::zeros());
+                let belief = contact(&patches, &edges);
+                assert!(if rests { belief > 0.95 } else { belief < 0.05 }, "{belief} of {gap} m");
+            });
+        }
+    }
+}
+
+#[test]
+fn a_pose_that_rests_elsewhere_loses_evidence_against_one_that_does_not() {
+    with_all(BODIES[0], PLAIN, Default::default(), |search| {
+        let at = |up: f64| seen(search, &Vector6::new(0.0, 0.0, 0.0, 0.0, 0.0, up));
+        let poses = [at(0.03), at(0.0), at(-0.003), Vec::new()];
+        let told = supported(poses.iter().map(Vec::as_slice));
+        assert!(told[1] == 0.0 || told[1] > -0.5, "{told:?}");
+        assert!([0, 2, 3].iter().all(|&k| told[k] < told[1] - 2.0), "{told:?}");
+        // Where none has any, it is not known where the ground is.
+        assert_eq!(supported([&[][..], &[]].into_iter()), [0.0, 0.0]);
+    });
 }
