@@ -213,8 +213,9 @@ fn the_second_view_sees_a_point_move_by_the_derivatives() {
             };
             // On its wall a cup leans.
             let down = search.model.rest(&(place.rotation.inverse() * -Vector3::z())).down;
-            let level = UnitQuaternion::rotation_between(&(place.rotation * down), &-Vector3::z());
-            let place = Transform::from_parts(place.translation, level.unwrap() * place.rotation);
+            let upright =
+                UnitQuaternion::rotation_between(&(place.rotation * down), &-Vector3::z());
+            let place = Transform::from_parts(place.translation, upright.unwrap() * place.rotation);
             let still = Refined::new(&place, true);
             let mut checked = [0, 0];
             let spread = |k: usize, size: usize| size / 10 + k * size * 8 / 100;
