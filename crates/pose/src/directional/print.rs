@@ -87,8 +87,10 @@ const OF_GROUND: Trust = Trust {
 pub(super) const BETWEEN_TAIL: f64 = 3.0;
 pub(super) const SQUARE_TAIL: f64 = 3.0;
 
-/// Squares of the ground that are further than this from the middle one's level (px) are on other things.
-const LEVEL_PX: f64 = 0.3;
+/// Squares of the ground that are further than this from the middle one's level (px, and in deviations of
+/// their noise) are on other things.
+const LEVEL_PX: f64 = 0.2;
+const LEVEL_SD: f64 = 2.0;
 /// Poses that are less behind than this (nats) are told apart by what they rest on.
 const RIVALS: f64 = 12.0;
 /// Chance that an object rests on something else than the plane about it that both views see, and the
@@ -97,8 +99,8 @@ const ELSEWHERE: f64 = 0.03;
 const FEWER: f64 = 3.0;
 /// Gaps between an object and that plane where it does not rest on it are spread over so much (m), and the
 /// share of the variance that edges claim that is the core of what they are off by: the rest is for tails.
-const GAPS: f64 = 0.02;
-const CORE: f64 = 0.15;
+const GAPS: f64 = 0.01;
+const CORE: f64 = 0.2;
 
 /// A square of print seen by both views.
 #[derive(Debug, Clone, PartialEq)]
@@ -216,7 +218,8 @@ fn keep_level(squares: &mut Vec<Patch>) {
     squares.sort_by(|a, b| height(a).total_cmp(&height(b)));
     let Some(middle) = squares.get(squares.len() / 2).map(height) else { return };
     let all = squares.len();
-    squares.retain(|p| (p.residual - middle * p.by_surface).abs() < LEVEL_PX);
+    let near = |p: &Patch| LEVEL_PX.hypot(LEVEL_SD * p.noise_px);
+    squares.retain(|p| (p.residual - middle * p.by_surface).abs() < near(p));
     if 2 * squares.len() < all {
         squares.clear();
     }

@@ -126,12 +126,6 @@ impl<'a> Pair<'a> {
         Some(Seen { p, part: GROUND, normal: -rest.down })
     }
 
-    /// The second view has the object before a point beside it.
-    fn hidden(&self, p: &Vector3<f64>) -> bool {
-        let eye = self.eyes[1] / self.size;
-        self.search.model.first_hit(&eye, &(p / self.size - eye)).is_some()
-    }
-
     /// Where the square about a pixel of the first level is in the second, and its shift along the epipolar
     /// line by the surface along its own normal (px per m).
     pub fn carry_over(&self, x: usize, y: usize, seen: Seen) -> Option<(Place, f64)> {
@@ -154,7 +148,7 @@ impl<'a> Pair<'a> {
         for (dx, dy) in [(-corner, -corner), (corner, -corner), (corner, corner), (-corner, corner)]
         {
             let at = self.surface(pixel + Vector2::new(dx, dy))?;
-            if at.part != part || on_ground && self.hidden(&at.p) {
+            if at.part != part {
                 return None;
             }
         }
