@@ -232,16 +232,13 @@ impl Search<'_> {
             }
             self.doubt(refined, &FINAL);
         };
+        if contact < 1.0 - SURE {
+            *top = lifted;
+            return finish(top, false);
+        }
+        finish(top, true);
         if contact < SURE {
             finish(&mut lifted, false);
-        }
-        if contact > 1.0 - SURE {
-            finish(top, true);
-        } else {
-            *top = lifted;
-            return;
-        }
-        if contact < SURE {
             let apart = difference(&top.pose, &lifted.pose);
             top.pose = perturb(&top.pose, &(apart * (1.0 - contact)));
             top.covariance = top.covariance * contact

@@ -90,7 +90,7 @@ pub(super) const SQUARE_TAIL: f64 = 3.0;
 /// Squares of the ground that are further than this from the middle one's level (px, and in deviations of
 /// their noise) are on other things.
 const LEVEL_PX: f64 = 0.2;
-const LEVEL_SD: f64 = 2.0;
+const LEVEL_SD: f64 = 3.0;
 /// Poses that are less behind than this (nats) are told apart by what they rest on.
 const RIVALS: f64 = 12.0;
 /// Chance that an object rests on something else than the plane about it that both views see, and the
@@ -162,9 +162,10 @@ impl Search<'_> {
     /// Of poses that differ, best first, those that do not rest where the ground is lose evidence: a box on
     /// another side would have its landmark at another height. Best first again.
     pub(super) fn heed_ground(&self, different: &mut [(Refined, Explained)]) {
-        let Some(best) = different.first().map(|d| d.1.evidence) else { return };
+        let best = different.first().map_or(0.0, |d| d.1.evidence);
         let rivals = different.iter().filter(|d| best - d.1.evidence < RIVALS).count();
-        if rivals < 2 {
+        // The landmark is always as high above the ground on an object that is known to stand.
+        if rivals < 2 || self.query.standing == Some(true) {
             return;
         }
         let seen = |(refined, _): &(Refined, Explained)| {
