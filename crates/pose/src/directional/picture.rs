@@ -37,8 +37,9 @@ pub fn draw(trace: &Trace) -> Vec<(String, Canvas)> {
         }
         // Squares of print have their places in the first view.
         let squares = if view == 0 { &trace.patches[..] } else { &[] };
-        for at in squares.iter().map(|patch| patch.pixel) {
-            canvas.circle(enlarged(scale, at.x, at.y), 1.0, BLUE);
+        for patch in squares {
+            let colour = if patch.on_ground() { ORANGE } else { BLUE };
+            canvas.circle(enlarged(scale, patch.pixel.x, patch.pixel.y), 1.0, colour);
         }
         out.push((format!("view{view}-5-residuals"), canvas));
     }
