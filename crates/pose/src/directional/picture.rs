@@ -7,7 +7,7 @@ use std::f64::consts::PI;
 
 use nalgebra::Point3;
 use vergence_geometry::Transform;
-use vergence_imaging::canvas::colour::{BLUE, GREEN, ORANGE, YELLOW};
+use vergence_imaging::canvas::colour::{BLUE, GREEN, ORANGE, PURPLE, YELLOW};
 use vergence_imaging::{Canvas, Image};
 
 use super::Trace;
@@ -38,7 +38,7 @@ pub fn draw(trace: &Trace) -> Vec<(String, Canvas)> {
         // Squares of print have their places in the first view.
         let squares = if view == 0 { &trace.patches[..] } else { &[] };
         for patch in squares {
-            let colour = if patch.on_ground() { ORANGE } else { BLUE };
+            let colour = if patch.on_ground() { PURPLE } else { BLUE };
             canvas.circle(enlarged(scale, patch.pixel.x, patch.pixel.y), 1.0, colour);
         }
         out.push((format!("view{view}-5-residuals"), canvas));
