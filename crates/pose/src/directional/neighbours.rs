@@ -177,12 +177,28 @@ impl Search<'_> {
     /// The mean of some optima by belief, with the second moment about it of all by doubt.
     fn mixture(&self, optima: Vec<(Refined, Explained)>) -> (Refined, Explained) {
         // Which of the tops of the edges is as far away as the surface is, print knows.
-        let seen: Vec<Vec<Patch>> = optima.iter().map(|o| self.patches(&o.0)).collect();
-        let told = print::supported(seen.iter().map(Vec::as_slice));
-        let all = optima.into_iter().zip(seen).zip(told);
-        let all = all.map(|(((mut refined, explained), patches), told)| {
-            refined.patches = patches;
-            let evidence = explained.evidence + print::evidence(&refined.patches) + told;
+        let seen: Vec<Vec<Patch>> = optima.iter().map(|o| self.print(&o.0)).collect();
+        // The ground is looked for once: from top to top it is but a little higher or lower.
+        let ground = optima.iter().find_map(|(top, _)| {
+            Some((top, self.ground(top))).filter(|(_, squares)| !squares.is_empty())
+        });
+        let ground_of = |refined: &Refined| {
+            let (top, squares) = ground.as_ref()?;
+            let moved = top.to(refined);
+            Some(
+                squares
+                    .iter()
+                    .map(move |p| Patch { residual: p.left(&moved), ..p.clone() })
+                    .collect(),
+            )
+        };
+        let ground: Vec<Vec<Patch>> =
+            optima.iter().map(|o| ground_of(&o.0).unwrap_or_default()).collect();
+        let told = print::supported(ground.iter().map(Vec::as_slice));
+        let all = optima.into_iter().zip(seen.into_iter().zip(ground)).zip(told);
+        let all = all.map(|(((mut refined, explained), (on_object, on_ground)), told)| {
+            let evidence = explained.evidence + print::evidence(&on_object) + told;
+            refined.patches = [on_object, on_ground].concat();
             (evidence, refined, explained)
         });
         let mut optima: Vec<(f64, Refined, Explained)> = all.collect();
@@ -222,23 +238,23 @@ impl Search<'_> {
         lifted.patches.retain(|p| !p.on_ground());
         self.doubt(&mut lifted, &FINAL);
         let contact = print::contact(&top.patches, &lifted.covariance);
-        let finish = |refined: &mut Refined, on_ground: bool| {
+        let finish = |refined: &mut Refined| {
             self.refine(refined, &[POLISH]);
             // The print was looked for where the contour had the object: where both have it is better.
             if !refined.patches.is_empty() {
-                refined.patches = self.patches(refined);
-                refined.patches.retain(|p| on_ground || !p.on_ground());
+                refined.patches.retain(Patch::on_ground);
+                refined.patches.extend(self.print(refined));
                 self.refine(refined, &[POLISH]);
             }
             self.doubt(refined, &FINAL);
         };
         if contact < 1.0 - SURE {
             *top = lifted;
-            return finish(top, false);
+            return finish(top);
         }
-        finish(top, true);
+        finish(top);
         if contact < SURE {
-            finish(&mut lifted, false);
+            finish(&mut lifted);
             let apart = difference(&top.pose, &lifted.pose);
             top.pose = perturb(&top.pose, &(apart * (1.0 - contact)));
             top.covariance = top.covariance * contact

@@ -142,21 +142,16 @@ impl Patch {
 }
 
 impl Search<'_> {
-    /// The squares of print that both views show of a refined object and of what it rests on.
-    pub(super) fn patches(&self, refined: &Refined) -> Vec<Patch> {
+    /// The squares of print that both views show of a refined object.
+    pub(super) fn print(&self, refined: &Refined) -> Vec<Patch> {
         let Some(pair) = Pair::new(self, refined) else { return Vec::new() };
-        let within = extent(&refined.sites, &pair.sights[0].fine);
-        let mut out = squares(&pair, within, false);
-        out.extend(self.ground(&pair));
-        out
+        squares(&pair, extent(&refined.sites, &pair.sights[0].fine), false)
     }
 
-    /// The squares of what a refined object rests on.
-    fn ground(&self, pair: &Pair) -> Vec<Patch> {
-        if !pair.rests() {
-            return Vec::new();
-        }
-        squares(pair, whole(&pair.sights[0].fine), true)
+    /// The squares of what a refined object seems to rest on.
+    pub(super) fn ground(&self, refined: &Refined) -> Vec<Patch> {
+        let pair = Pair::new(self, refined).filter(Pair::rests);
+        pair.map_or_else(Vec::new, |pair| squares(&pair, whole(&pair.sights[0].fine), true))
     }
 
     /// Of poses that differ, best first, those that do not rest where the ground is lose evidence: a box on
@@ -168,10 +163,7 @@ impl Search<'_> {
         if rivals < 2 || self.query.standing == Some(true) {
             return;
         }
-        let seen = |(refined, _): &(Refined, Explained)| {
-            Pair::new(self, refined).map_or_else(Vec::new, |pair| self.ground(&pair))
-        };
-        let seen: Vec<Vec<Patch>> = different[..rivals].iter().map(seen).collect();
+        let seen: Vec<Vec<Patch>> = different[..rivals].iter().map(|d| self.ground(&d.0)).collect();
         let told = supported(seen.iter().map(Vec::as_slice));
         different.iter_mut().zip(told).for_each(|(d, told)| d.1.evidence += told);
         different.sort_by(|a, b| b.1.evidence.total_cmp(&a.1.evidence));

@@ -13,7 +13,7 @@
 
 use nalgebra::{Matrix3, Matrix6, SMatrix, SVector, Vector2, Vector3};
 use vergence_geometry::Transform;
-use vergence_geometry::gaussian::{perturb, skew};
+use vergence_geometry::gaussian::{difference, perturb, skew};
 
 use super::equations::{Edge, Equations, Move, Offsets, Solution, VIEWS, by_part, part_of};
 use super::print::Patch;
@@ -324,6 +324,16 @@ impl Refined {
         self.form += moved.shared.fixed_rows::<3>(FORM_AT);
         self.turns.iter_mut().zip(&moved.own).for_each(|(turn, step)| *turn += step);
         self.patches.iter_mut().for_each(|p| p.residual = p.left(moved));
+    }
+
+    /// How its unknowns have to change to become another's.
+    pub(super) fn to(&self, other: &Refined) -> Move {
+        let mut moved = Move::default();
+        moved.shared.fixed_rows_mut::<6>(0).copy_from(&difference(&self.pose, &other.pose));
+        moved.shared.fixed_rows_mut::<3>(FORM_AT).copy_from(&(other.form - self.form));
+        let turns = other.turns.iter().zip(&self.turns);
+        moved.own.iter_mut().zip(turns).for_each(|(own, (to, from))| *own = to - from);
+        moved
     }
 
     /// The unknowns alone.
