@@ -239,13 +239,13 @@ impl Search<'_> {
         self.doubt(&mut lifted, &FINAL);
         let contact = print::contact(&top.patches, &lifted.covariance);
         let finish = |refined: &mut Refined| {
-            self.refine(refined, &[POLISH]);
-            // The print was looked for where the contour had the object: where both have it is better.
+            // Print was looked for where the contour had the object: where both have it is better.
             if !refined.patches.is_empty() {
+                self.refine(refined, &[FINAL]);
                 refined.patches.retain(Patch::on_ground);
                 refined.patches.extend(self.print(refined));
-                self.refine(refined, &[POLISH]);
             }
+            self.refine(refined, &[POLISH]);
             self.doubt(refined, &FINAL);
         };
         if contact < 1.0 - SURE {
