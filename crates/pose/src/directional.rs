@@ -4,8 +4,8 @@
 //! Reads top to bottom: gradients where the object can be ([`level`]), oriented edges ([`edges`]),
 //! directional fields ([`field`]), rotations that explain them ([`search`]), refinement on sub-pixel
 //! edges with several candidates a site ([`sites`], [`refine`]), the tops nearby and the print that both
-//! views see ([`neighbours`], [`print`]), and how much the best explains that a different pose would not
-//! ([`verdict`]).
+//! views see on the object and on what it rests on ([`neighbours`], [`print`]), and how much the best
+//! explains that a different pose would not ([`verdict`]).
 
 pub mod edges;
 mod equations;

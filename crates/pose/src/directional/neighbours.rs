@@ -11,6 +11,7 @@
 //! sit on the wrong line of print says so.
 //!
 //! Which top is as far away as the object's surface is, print that both views see can tell ([`print`]).
+//! Whether the object rests on the ground about it is a belief of its own, and makes a mixture, too.
 
 use nalgebra::{Matrix6, Vector6};
 use vergence_geometry::gaussian::{difference, perturb};
@@ -185,12 +186,7 @@ impl Search<'_> {
         let ground_of = |refined: &Refined| {
             let (top, squares) = ground.as_ref()?;
             let moved = top.to(refined);
-            Some(
-                squares
-                    .iter()
-                    .map(move |p| Patch { residual: p.left(&moved), ..p.clone() })
-                    .collect(),
-            )
+            Some(squares.iter().map(|p| p.after(&moved)).collect())
         };
         let ground: Vec<Vec<Patch>> =
             optima.iter().map(|o| ground_of(&o.0).unwrap_or_default()).collect();

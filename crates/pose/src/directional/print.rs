@@ -21,10 +21,10 @@ mod square;
 #[cfg(test)]
 mod tests;
 
+use std::f64::consts::PI;
 use std::ops::Range;
 
 use nalgebra::{Matrix6, Point2, RowVector2, RowVector6};
-use std::f64::consts::PI;
 
 use super::equations::{Move, VIEWS};
 use super::level::Level;
@@ -138,6 +138,11 @@ impl Patch {
     pub(super) fn left(&self, moved: &Move) -> f64 {
         let turns = self.by_turn.iter().zip(&moved.own).map(|(by, turn)| (by * turn).x);
         self.residual - (self.by_shared * moved.shared).x - turns.sum::<f64>()
+    }
+
+    /// The square as seen from where the unknowns have moved to.
+    pub(super) fn after(&self, moved: &Move) -> Self {
+        Patch { residual: self.left(moved), ..self.clone() }
     }
 }
 
