@@ -20,7 +20,7 @@ use multiversion::multiversion;
 use nalgebra::{Cholesky, Const, Matrix6, RowVector2, SMatrix, SVector, Vector2, Vector3};
 
 use super::landmark::Landmark;
-use super::print::{BETWEEN_TAIL, Patch, SQUARE_TAIL};
+use super::print::{BETWEEN_TAIL, Patch, SLOPE_SD, SQUARE_TAIL};
 use super::sites::{ByShared, LIP_AT, SHARED, Site};
 
 /// Unknowns of each view: small turns of its camera.
@@ -159,12 +159,12 @@ impl Equations {
     /// far the unknowns are from where its residuals were measured.
     pub fn surface(&mut self, patches: &[Patch], offsets: &[Offsets], moved: &Move) {
         let Some(first) = patches.first() else { return };
-        let Offsets { part, .. } = Offsets::of_surface(first.part, 0.0);
+        let part = SURFACES | u32::from(first.part);
         let seen = seen(offsets, part);
         let doubt = self.doubt * self.doubt;
         let trust = first.trust();
         let shared = tailed(trust.surface_sd.powi(2), seen.shared, trust.surface_tail);
-        let slope = trust.slope_sd.powi(2).max(1e-12);
+        let slope = SLOPE_SD * SLOPE_SD;
         let between = tailed(trust.between_sd_px.powi(2), seen.own_px[0], BETWEEN_TAIL);
         let mut sums = Sums::new();
         // In place of a part's tilt and of its offset in a view a surface has slopes and what the views
@@ -416,13 +416,6 @@ pub struct Offsets {
     shared: f64,
     /// In each view beside that (px).
     own_px: [f64; VIEWS],
-}
-
-impl Offsets {
-    /// Of one of the surfaces that have print, by so much (m).
-    pub(super) fn of_surface(part: u16, shared: f64) -> Self {
-        Offsets { part: SURFACES | u32::from(part), shared, ..Offsets::default() }
-    }
 }
 
 /// What the equations give.

@@ -180,18 +180,18 @@ impl Search<'_> {
         // Which of the tops of the edges is as far away as the surface is, print knows.
         let seen: Vec<Vec<Patch>> = optima.iter().map(|o| self.print(&o.0)).collect();
         // The ground is looked for once: from top to top it is but a little higher or lower.
-        let ground = optima.iter().find_map(|(top, _)| {
-            Some((top, self.ground(top))).filter(|(_, squares)| !squares.is_empty())
-        });
-        let ground_of = |refined: &Refined| {
-            let (top, squares) = ground.as_ref()?;
-            let moved = top.to(refined);
-            Some(squares.iter().map(|p| p.after(&moved)).collect())
+        let mut found = optima.iter().map(|(top, _)| (top, self.ground(top)));
+        let ground = found.find(|(_, squares)| !squares.is_empty());
+        let from = |refined: &Refined| match &ground {
+            Some((top, squares)) => {
+                let moved = top.to(refined);
+                squares.iter().map(|p| p.after(&moved)).collect()
+            }
+            None => Vec::new(),
         };
-        let ground: Vec<Vec<Patch>> =
-            optima.iter().map(|o| ground_of(&o.0).unwrap_or_default()).collect();
-        let told = print::supported(ground.iter().map(Vec::as_slice));
-        let all = optima.into_iter().zip(seen.into_iter().zip(ground)).zip(told);
+        let grounds: Vec<Vec<Patch>> = optima.iter().map(|o| from(&o.0)).collect();
+        let told = print::supported(&grounds);
+        let all = optima.into_iter().zip(seen.into_iter().zip(grounds)).zip(told);
         let all = all.map(|(((mut refined, explained), (on_object, on_ground)), told)| {
             let evidence = explained.evidence + print::evidence(&on_object) + told;
             refined.patches = [on_object, on_ground].concat();
@@ -230,10 +230,6 @@ impl Search<'_> {
     /// Refines a top by all there is to see, its covariance included. Where it is open whether the object
     /// rests on the ground about it, it gets the mean of both.
     fn polish(&self, top: &mut Refined) {
-        let mut lifted = top.clone();
-        lifted.patches.retain(|p| !p.on_ground());
-        self.doubt(&mut lifted, &FINAL);
-        let contact = print::contact(&top.patches, &lifted.covariance);
         let finish = |refined: &mut Refined| {
             // Print was looked for where the contour had the object: where both have it is better.
             if !refined.patches.is_empty() {
@@ -244,6 +240,14 @@ impl Search<'_> {
             self.refine(refined, &[POLISH]);
             self.doubt(refined, &FINAL);
         };
+        let (ground, print): (Vec<Patch>, Vec<Patch>) =
+            top.patches.iter().cloned().partition(Patch::on_ground);
+        if ground.is_empty() {
+            return finish(top);
+        }
+        let mut lifted = Refined { patches: print, ..top.clone() };
+        self.doubt(&mut lifted, &FINAL);
+        let contact = print::contact(&ground, &lifted.covariance);
         if contact < 1.0 - SURE {
             *top = lifted;
             return finish(top);

@@ -52,8 +52,6 @@ pub(super) struct Trust {
     pub surface_sd: f64,
     /// See `surface_sd`.
     pub surface_tail: f64,
-    /// Deviation of its slopes against the object (rad).
-    pub slope_sd: f64,
     /// Deviation of where one view sees its print from where the other does (px), with heavy tails.
     pub between_sd_px: f64,
 }
@@ -67,7 +65,6 @@ const OF_OBJECT: Trust = Trust {
     worth: 0.15,
     surface_sd: 0.0004,
     surface_tail: f64::INFINITY,
-    slope_sd: 0.0,
     between_sd_px: 0.06,
 };
 /// What the object rests on: feet and bent bottoms lift it a little, a coaster or a hand by more. It is
@@ -79,10 +76,11 @@ const OF_GROUND: Trust = Trust {
     worth: 0.5,
     surface_sd: 0.0004,
     surface_tail: 1.0,
-    slope_sd: 0.003,
     between_sd_px: 0.03,
 };
 
+/// Deviation of the ground's slopes against the object (rad); the object's own surfaces have none.
+pub(super) const SLOPE_SD: f64 = 0.003;
 /// Degrees of freedom of what the views differ by about a surface, and of a square's shift.
 pub(super) const BETWEEN_TAIL: f64 = 3.0;
 pub(super) const SQUARE_TAIL: f64 = 3.0;
@@ -169,7 +167,7 @@ impl Search<'_> {
             return;
         }
         let seen: Vec<Vec<Patch>> = different[..rivals].iter().map(|d| self.ground(&d.0)).collect();
-        let told = supported(seen.iter().map(Vec::as_slice));
+        let told = supported(&seen);
         different.iter_mut().zip(told).for_each(|(d, told)| d.1.evidence += told);
         different.sort_by(|a, b| b.1.evidence.total_cmp(&a.1.evidence));
     }
@@ -227,18 +225,18 @@ fn keep_level(squares: &mut Vec<Patch>) {
 /// views see and the nearer it is to where it should be. A surface that has it elsewhere says nothing: it
 /// may be gloss.
 pub(super) fn evidence(patches: &[Patch]) -> f64 {
-    let surfaces = patches.chunk_by(|a, b| a.part == b.part).filter(|s| !s[0].on_ground());
+    let surfaces = patches.chunk_by(|a, b| a.part == b.part);
     surfaces.map(|s| (OF_OBJECT.worth * s.len() as f64 - off(s)).max(0.0)).sum()
 }
 
-/// What speaks against each of some poses (nats, at most zero) as the ground does not seem to be where the
-/// object would rest. That there is a plane says nothing for the object.
-pub(super) fn supported<'a>(poses: impl Iterator<Item = &'a [Patch]>) -> Vec<f64> {
-    let found = |patches: &[Patch]| {
-        let on_ground = patches.chunk_by(|a, b| a.part == b.part).find(|s| s[0].on_ground());
-        on_ground.map_or(0.0, |s| s.len() as f64 * (-off(s) / FEWER).exp())
+/// What speaks against each of some poses (nats, at most zero) as the ground that it was found with does not
+/// seem to be where the object would rest. That there is a plane says nothing for the object.
+pub(super) fn supported(grounds: &[Vec<Patch>]) -> Vec<f64> {
+    let found = |ground: &Vec<Patch>| match ground.len() {
+        0 => 0.0,
+        n => n as f64 * (-off(ground) / FEWER).exp(),
     };
-    let found: Vec<f64> = poses.map(found).collect();
+    let found: Vec<f64> = grounds.iter().map(found).collect();
     let most = found.iter().copied().fold(0.0, f64::max);
     if most == 0.0 {
         return vec![0.0; found.len()];
@@ -250,13 +248,14 @@ pub(super) fn supported<'a>(poses: impl Iterator<Item = &'a [Patch]>) -> Vec<f64
 /// Belief that the object rests on the ground that it was found with, where its edges alone leave it with
 /// this covariance: a gap of millimetres is a coaster or a hand, one that the edges cannot tell from none
 /// is none.
-pub(super) fn contact(patches: &[Patch], covariance: &Matrix6<f64>) -> f64 {
-    let mut surfaces = patches.chunk_by(|a, b| a.part == b.part);
-    let Some(squares) = surfaces.find(|s| s[0].on_ground()) else { return 0.0 };
-    let (shift, by_surface, _) = mean(squares);
+pub(super) fn contact(ground: &[Patch], covariance: &Matrix6<f64>) -> f64 {
+    if ground.is_empty() {
+        return 0.0;
+    }
+    let (shift, by_surface, _) = mean(ground);
     let gap = shift / by_surface;
-    let by_pose = squares.iter().map(|p| p.by_shared.fixed_columns::<6>(0) / p.by_surface);
-    let by_pose = by_pose.sum::<RowVector6<f64>>() / squares.len() as f64;
+    let by_pose = ground.iter().map(|p| p.by_shared.fixed_columns::<6>(0) / p.by_surface);
+    let by_pose = by_pose.sum::<RowVector6<f64>>() / ground.len() as f64;
     let edges = (by_pose * covariance * by_pose.transpose()).x;
     let variance = CORE * edges + OF_GROUND.surface_sd.powi(2);
     let contact = (-0.5 * gap * gap / variance).exp() / (2.0 * PI * variance).sqrt();

@@ -280,15 +280,14 @@ impl Search<'_> {
     /// The small turn (base frame) that would make the object rest exactly, when it seems to, and a
     /// projection onto the turns that resting keeps it from.
     fn tilt(&self, state: &Refined) -> Option<(Vector3<f64>, Matrix3<f64>)> {
-        let up = self.query.up?.into_inner();
+        let (rest, tilt) = self.rest(state)?;
         let turn = state.pose.rotation.to_rotation_matrix();
-        let rest = self.rest(state)?;
-        let nearest = turn * -rest.down;
-        Some((nearest.cross(&up), turn * rest.held * turn.inverse()))
+        Some((tilt, turn * rest.held * turn.inverse()))
     }
 
-    /// How the object rests in a state, when it seems to.
-    pub(super) fn rest(&self, state: &Refined) -> Option<Rest> {
+    /// How the object rests in a state, when it seems to, and the small turn (base frame) that would make it
+    /// rest exactly.
+    pub(super) fn rest(&self, state: &Refined) -> Option<(Rest, Vector3<f64>)> {
         let up = self.query.up?.into_inner();
         let turn = state.pose.rotation.to_rotation_matrix();
         let rest = match self.query.standing {
@@ -300,7 +299,7 @@ impl Search<'_> {
         let tilt = nearest.cross(&up);
         let rests = nearest.dot(&up) > 0.0
             && (tilt.norm() < STANDING_LIMIT || state.rests || self.query.standing == Some(true));
-        rests.then_some(rest)
+        rests.then_some((rest, tilt))
     }
 }
 

@@ -248,12 +248,13 @@ impl Polyhedron {
         }
     }
 
-    /// Where a ray from the eye first meets the body: the distance in lengths of the direction, and the
-    /// face.
+    /// As [`super::Model::reach`].
     pub(super) fn reach(&self, direction: &Vector3<f64>) -> f64 {
         self.vertices.iter().map(|v| v.dot(direction)).fold(f64::NEG_INFINITY, f64::max)
     }
 
+    /// Where a ray from the eye first meets the body: the distance in lengths of the direction, and the
+    /// face.
     pub(super) fn first_hit(&self, eye: &Vector3<f64>, along: &Vector3<f64>) -> Option<Hit> {
         let faces = self.faces.iter().enumerate();
         let hits =

@@ -72,13 +72,14 @@ impl Frustum {
         }
     }
 
-    /// Where a ray from the eye first meets the body from outside. What is seen through an open top is
-    /// no part of it.
+    /// As [`super::Model::reach`].
     pub(super) fn reach(&self, direction: &Vector3<f64>) -> f64 {
         let (up, out) = (self.half_height * direction.z, direction.xy().norm());
         (self.top * out + up).max(self.bottom * out - up)
     }
 
+    /// Where a ray from the eye first meets the body from outside. What is seen through an open top is
+    /// no part of it.
     pub(super) fn first_hit(&self, eye: &Vector3<f64>, along: &Vector3<f64>) -> Option<Hit> {
         let (slope, middle) = (self.slope(), (self.top + self.bottom) / 2.0);
         // |x, y|^2 = radius(z)^2 along the ray.

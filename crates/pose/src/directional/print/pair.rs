@@ -32,6 +32,8 @@ struct Ground {
     rest: Rest,
     /// Where the vertical through the object's middle meets it (object frame, m).
     foot: Vector3<f64>,
+    /// Two unit vectors along it (object frame).
+    across: [Vector3<f64>; 2],
 }
 
 /// A point that the first view sees.
@@ -81,9 +83,10 @@ impl<'a> Pair<'a> {
             Some((camera.project(&p)?.coords, HOUSING * camera.fx / p.z))
         });
         let tags = tags.collect();
-        let ground = search.rest(refined).map(|rest| {
+        let ground = search.rest(refined).map(|(rest, _)| {
             let foot = rest.down * search.model.reach(&rest.down) * size;
-            Ground { rest, foot }
+            let across = rest.down.cross(&Vector3::ith(rest.down.iamin(), 1.0)).normalize();
+            Ground { rest, foot, across: [across, across.cross(&rest.down)] }
         });
         Some(Pair {
             search,
@@ -116,7 +119,7 @@ impl<'a> Pair<'a> {
 
     /// Where a ray of the first view meets what the object rests on.
     fn ground(&self, ray: &Vector3<f64>) -> Option<Seen> {
-        let Ground { rest, foot } = self.ground.as_ref()?;
+        let Ground { rest, foot, .. } = self.ground.as_ref()?;
         let descent = rest.down.dot(ray);
         if descent < GRAZING {
             return None;
@@ -217,9 +220,7 @@ impl<'a> Pair<'a> {
         match &self.ground {
             Some(ground) if at.part == GROUND => {
                 let beside = at.p - ground.foot;
-                let across = ground.rest.down.cross(&Vector3::ith(ground.rest.down.iamin(), 1.0));
-                let across = across.normalize();
-                RowVector2::new(beside.dot(&across), beside.dot(&across.cross(&ground.rest.down)))
+                ground.across.map(|across| beside.dot(&across)).into()
             }
             _ => RowVector2::zeros(),
         }
