@@ -284,9 +284,9 @@ fn seen(offsets: &[Offsets], part: u32) -> Offsets {
 }
 
 /// Variance of what has heavy tails, a Student's t of so many degrees of freedom, once it was seen to be
-/// off by so much: by much is less surprising then.
+/// off by so much: by much is less surprising then. With infinitely many it is Gaussian.
 fn tailed(variance: f64, seen: f64, tail: f64) -> f64 {
-    if tail.is_infinite() { variance } else { (tail * variance + seen * seen) / (tail + 1.0) }
+    variance + (seen * seen - variance) / (tail + 1.0)
 }
 
 /// Variance of a part's edges in each view about their mean (px^2).
