@@ -45,14 +45,14 @@ const TURN: i32 = 64;
 const NOTHING: u16 = u16::MAX / 2;
 
 /// The tables of one view.
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, Clone, Default)]
 pub struct Field {
     /// Of steep lines, whose rows are the level's, and of flat ones, whose rows are its columns.
     tables: Option<[Table; 2]>,
 }
 
 /// Half of the directions.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone)]
 struct Table {
     rows: usize,
     cols: usize,
@@ -65,7 +65,7 @@ struct Table {
 }
 
 /// One direction.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone)]
 struct Slot {
     /// Column shift of a line through row 0, at every row.
     shift: Vec<i32>,
@@ -218,12 +218,23 @@ thread_local! {
 /// Tables whose storage is kept: those of two views.
 const SPARES: usize = 4;
 
+/// Storage of at least this size, with what it last held.
+fn spare(size: usize) -> Vec<u16> {
+    let kept = SPARE.with_borrow_mut(|spare| {
+        let fits = spare.iter().position(|s| s.len() >= size);
+        fits.map(|k| spare.remove(k))
+    });
+    kept.unwrap_or_else(|| vec![0; size])
+}
+
 impl Drop for Table {
     fn drop(&mut self) {
         let sums = std::mem::take(&mut self.sums);
         SPARE.with_borrow_mut(|spare| {
-            if spare.len() < SPARES {
-                spare.push(sums);
+            spare.push(sums);
+            spare.sort_by_key(Vec::len);
+            if spare.len() > SPARES {
+                spare.remove(0);
             }
         });
     }
@@ -279,12 +290,7 @@ fn sweep(
     slots: &mut [Slot],
 ) -> Vec<u16> {
     const CAP: u16 = (CAP_PX * UNIT as f32) as u16;
-    let mut sums = SPARE.with_borrow_mut(Vec::pop).unwrap_or_default();
-    let size = (ends.len() + 1) * SLOTS * stride;
-    if sums.capacity() < size {
-        sums = vec![0; size];
-    }
-    sums.resize(size, 0);
+    let mut sums = spare((ends.len() + 1) * SLOTS * stride);
     sums[..SLOTS * stride].fill(0);
     let padded = stride - 2;
     let wide = padded + LANES;

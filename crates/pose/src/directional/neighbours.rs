@@ -180,7 +180,7 @@ impl Search<'_> {
         // Which of the tops of the edges is as far away as the surface is, print knows.
         let seen: Vec<Vec<Patch>> = optima.iter().map(|o| self.print(&o.0)).collect();
         // The ground is looked for once: from top to top it is but a little higher or lower.
-        let mut found = optima.iter().map(|(top, _)| (top, self.ground(top)));
+        let mut found = optima.iter().map(|(top, _)| (top, self.ground(top, print::ENOUGH)));
         let ground = found.find(|(_, squares)| !squares.is_empty());
         let from = |refined: &Refined| match &ground {
             Some((top, squares)) => {

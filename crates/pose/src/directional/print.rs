@@ -85,6 +85,8 @@ pub(super) const SLOPE_SD: f64 = 0.003;
 pub(super) const BETWEEN_TAIL: f64 = 3.0;
 pub(super) const SQUARE_TAIL: f64 = 3.0;
 
+/// Squares of the ground that are enough for a pose: what the views differ by matters more than noise then.
+pub(super) const ENOUGH: usize = 100;
 /// Squares of the ground that are further than this from the middle one's level (px, and in deviations of
 /// their noise) are on other things.
 const LEVEL_PX: f64 = 0.2;
@@ -148,13 +150,13 @@ impl Search<'_> {
     /// The squares of print that both views show of a refined object.
     pub(super) fn print(&self, refined: &Refined) -> Vec<Patch> {
         let Some(pair) = Pair::new(self, refined) else { return Vec::new() };
-        squares(&pair, extent(&refined.sites, &pair.sights[0].fine), false)
+        squares(&pair, extent(&refined.sites, &pair.sights[0].fine), false, usize::MAX)
     }
 
-    /// The squares of what a refined object seems to rest on.
-    pub(super) fn ground(&self, refined: &Refined) -> Vec<Patch> {
+    /// The squares of what a refined object seems to rest on, all or so many as are enough.
+    pub(super) fn ground(&self, refined: &Refined, enough: usize) -> Vec<Patch> {
         let pair = Pair::new(self, refined).filter(Pair::rests);
-        pair.map_or_else(Vec::new, |pair| squares(&pair, whole(&pair.sights[0].fine), true))
+        pair.map_or_else(Vec::new, |pair| squares(&pair, whole(&pair.sights[0].fine), true, enough))
     }
 
     /// Of poses that differ, best first, those that do not rest where the ground is lose evidence: a box on
@@ -166,39 +168,27 @@ impl Search<'_> {
         if rivals < 2 || self.query.standing == Some(true) {
             return;
         }
-        let seen: Vec<Vec<Patch>> = different[..rivals].iter().map(|d| self.ground(&d.0)).collect();
+        // All squares: that a pose has more of them than another is what tells.
+        let seen = different[..rivals].iter().map(|d| self.ground(&d.0, usize::MAX));
+        let seen: Vec<Vec<Patch>> = seen.collect();
         let told = supported(&seen);
         different.iter_mut().zip(told).for_each(|(d, told)| d.1.evidence += told);
         different.sort_by(|a, b| b.1.evidence.total_cmp(&a.1.evidence));
     }
 }
 
-/// Squares all over a part of the first view, of the ground or of everything else.
-fn squares(pair: &Pair, [columns, rows]: [Range<usize>; 2], ground: bool) -> Vec<Patch> {
+/// Squares in a part of the first view, of the ground or of everything else: of every other row and column
+/// first, then of those between, until there are enough, or so few that there will not be the least.
+fn squares(pair: &Pair, area: [Range<usize>; 2], ground: bool, enough: usize) -> Vec<Patch> {
     let trust = if ground { &OF_GROUND } else { &OF_OBJECT };
-    let [first, second] = pair.sights.map(|s| &s.fine);
     let step = trust.step * pair.sights[0].coarse.scale;
     let mut out: Vec<Patch> = Vec::new();
-    for y in rows.step_by(step) {
-        for x in columns.clone().step_by(step) {
-            let Some(here) = print_at(first, x, y, &trust.needs) else { continue };
-            let Some(middle) = pair.surface(pixel_of(first, x, y)) else { continue };
-            if (middle.part == GROUND) != ground {
-                continue;
-            }
-            let Some((place, by_surface)) = pair.carry_over(x, y, middle) else { continue };
-            let Some(found) = find(&here, first, second, &place, &trust.needs) else { continue };
-            out.push(Patch {
-                pixel: pixel_of(first, x, y).into(),
-                part: middle.part,
-                residual: found.shift,
-                noise_px: found.noise_px,
-                by_surface,
-                by_shared: pair.by_shared(&middle) * by_surface,
-                by_slope: pair.by_slope(&middle) * by_surface,
-                by_turn: place.by_turn.map(|by| found.along.transpose() * by),
-            });
+    for (k, from) in [(0, 0), (step, step), (step, 0), (0, step)].into_iter().enumerate() {
+        if k > 0 && !(k * trust.least / 4..enough).contains(&out.len()) {
+            break;
         }
+        let places = lattice(area.clone(), 2 * step, from);
+        out.extend(places.filter_map(|(x, y)| at(pair, x, y, ground)));
     }
     if ground {
         keep_level(&mut out);
@@ -206,6 +196,36 @@ fn squares(pair: &Pair, [columns, rows]: [Range<usize>; 2], ground: bool) -> Vec
     out.sort_by_key(|p| p.part);
     let surfaces = out.chunk_by(|a, b| a.part == b.part);
     surfaces.filter(|squares| squares.len() >= trust.least).flatten().cloned().collect()
+}
+
+/// Columns and rows of an area that are a step apart, row by row.
+fn lattice(
+    [columns, rows]: [Range<usize>; 2],
+    step: usize,
+    (right, down): (usize, usize),
+) -> impl Iterator<Item = (usize, usize)> {
+    let row = move |y| columns.clone().skip(right).step_by(step).map(move |x| (x, y));
+    rows.skip(down).step_by(step).flat_map(row)
+}
+
+/// The square about a pixel of the first level, on the ground or on the object.
+fn at(pair: &Pair, x: usize, y: usize, ground: bool) -> Option<Patch> {
+    let needs = if ground { &OF_GROUND.needs } else { &OF_OBJECT.needs };
+    let [first, second] = pair.sights.map(|s| &s.fine);
+    let here = print_at(first, x, y, needs)?;
+    let middle = pair.surface(pixel_of(first, x, y)).filter(|s| (s.part == GROUND) == ground)?;
+    let (place, by_surface) = pair.carry_over(x, y, middle)?;
+    let found = find(&here, first, second, &place, needs)?;
+    Some(Patch {
+        pixel: pixel_of(first, x, y).into(),
+        part: middle.part,
+        residual: found.shift,
+        noise_px: found.noise_px,
+        by_surface,
+        by_shared: pair.by_shared(&middle) * by_surface,
+        by_slope: pair.by_slope(&middle) * by_surface,
+        by_turn: place.by_turn.map(|by| found.along.transpose() * by),
+    })
 }
 
 /// Keeps the squares that are on one level with most; none where there is no such level.

@@ -4,6 +4,7 @@
 //! it, warped. **Out:** how far along the epipolar line it is from there. Means and slopes of brightness
 //! are taken out of both squares and their contrast is an unknown, so that only print counts.
 
+use multiversion::multiversion;
 use nalgebra::{Matrix2, SMatrix, Vector2};
 
 use crate::directional::equations::VIEWS;
@@ -77,6 +78,7 @@ pub fn print_at(level: &Level, x: usize, y: usize, needs: &Needs) -> Option<Squa
 }
 
 /// The grey levels around a pixel that is far enough from the border.
+#[inline(always)]
 fn square(level: &Level, x: usize, y: usize) -> Square {
     let mut out = Square::zeros();
     for (row, mut to) in (y - HALF..).zip(out.column_iter_mut()) {
@@ -98,6 +100,7 @@ const AT: [f32; LANES] = {
 };
 
 /// Without its mean and its slopes.
+#[inline(always)]
 fn flattened(square: &Square) -> Square {
     // Sum of k^2 over all pixels.
     const SQUARES: f32 = (SIDE * HALF * (HALF + 1) * SIDE / 3) as f32;
@@ -122,6 +125,7 @@ fn flattened(square: &Square) -> Square {
 
 /// Where the second picture shows a square: Gauss-Newton on shift and contrast, the slopes being the first
 /// picture's.
+#[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
 pub fn find(
     here: &Square,
     first: &Level,
@@ -129,6 +133,14 @@ pub fn find(
     place: &Place,
     needs: &Needs,
 ) -> Option<Found> {
+    let hh = here.norm_squared();
+    let look = |shift: f64| {
+        let there = flattened(&warped(second, place, shift)?);
+        let correlation = here.dot(&there) / (hh * there.norm_squared()).sqrt();
+        (correlation >= LEAST_CORRELATION).then_some((there, correlation))
+    };
+    // Most that fail do so here: the second view sees something else there.
+    let (mut there, mut correlation) = look(0.0)?;
     // A step in the second picture is this step in the first.
     let back = place.affine.try_inverse()?;
     let (x, y) = place.middle;
@@ -141,20 +153,21 @@ pub fn find(
         |step: Vector2<f64>| flattened(&(slopes[0] * step.x as f32 + slopes[1] * step.y as f32));
     let across = Vector2::new(-place.epipolar.y, place.epipolar.x);
     let (slopes, level) = (along(back * place.epipolar), along(back * across));
-    let (hh, hs, ss) = (here.norm_squared(), here.dot(&slopes), slopes.norm_squared());
+    let (hs, ss) = (here.dot(&slopes), slopes.norm_squared());
     let determinant = hh * ss - hs * hs;
     if determinant <= 1e-6 * hh * ss {
         return None;
     }
-    let (mut shift, mut found) = (0.0, None);
-    for _ in 0..ROUNDS {
-        let there = flattened(&warped(second, place, shift)?);
+    let (mut shift, mut noise_px) = (0.0, f64::INFINITY);
+    for round in 0..ROUNDS {
+        if round > 0 {
+            (there, correlation) = look(shift)?;
+        }
         let (ht, st, tt) = (here.dot(&there), slopes.dot(&there), there.norm_squared());
         // there = gain here - moved slopes.
         let gain = (ht * ss - st * hs) / determinant;
         let moved = (ht * hs - st * hh) / determinant;
-        let correlation = ht / (hh * tt).sqrt();
-        if gain < LEAST_GAIN || gain > LEAST_GAIN.recip() || correlation < LEAST_CORRELATION {
+        if gain < LEAST_GAIN || gain > LEAST_GAIN.recip() {
             return None;
         }
         let change = f64::from(moved / gain);
@@ -163,13 +176,11 @@ pub fn find(
             return None;
         }
         let rest = (tt - gain * ht + moved * st).max(0.0) / (PIXELS - 5) as f32;
-        let noise_px = f64::from((rest * hh / determinant).sqrt() / gain);
-        found = Some((correlation, noise_px));
+        noise_px = f64::from((rest * hh / determinant).sqrt() / gain);
         if change.abs() < STILL_PX {
             break;
         }
     }
-    let (correlation, noise_px) = found?;
     let slant = f64::from(level.dot(&slopes) / ss);
     let noise_px = noise_px.hypot(slant * ACROSS_SD_PX).max(LEAST_NOISE_PX);
     let along = place.epipolar + across * slant;
@@ -179,26 +190,37 @@ pub fn find(
 
 /// The second picture where the square's pixels are in it, shifted along the epipolar line; `None` when
 /// some are outside.
+#[inline(always)]
 fn warped(level: &Level, place: &Place, shift: f64) -> Option<Square> {
     let (width, height) = (level.width(), level.height());
     let data = level.smooth.data();
     let middle = (place.there + place.epipolar * shift).cast::<f32>();
-    let mut out = Square::zeros();
     let (affine, bend) = (place.affine.cast::<f32>(), place.bend.map(|b| b.cast::<f32>()));
     let (most_x, most_y) = (width as f32 - 1.0, height as f32 - 1.0);
+    let along = |axis: usize| AT.map(|x| affine[(axis, 0)] * x + bend[0][axis] * (x * x));
+    let along = [along(0), along(1)];
+    let mut out = Square::zeros();
     for (mut row, y) in out.column_iter_mut().zip(AT) {
         let start = affine.column(1) * y + bend[1] * (y * y) + middle;
-        for (value, x) in row.iter_mut().zip(AT).take(SIDE) {
-            let at = start + affine.column(0) * x + bend[0] * (x * x);
-            if !(at.x >= 0.0 && at.y >= 0.0 && at.x < most_x && at.y < most_y) {
-                return None;
-            }
-            let (column, row) = (at.x as usize, at.y as usize);
-            let (right, down) = (at.x - column as f32, at.y - row as f32);
-            let i = row * width + column;
-            let along = |i: usize| data[i] + right * (data[i + 1] - data[i]);
-            let (above, below) = (along(i), along(i + width));
-            *value = above + down * (below - above);
+        let (xs, ys) = (along[0].map(|x| start.x + x), along[1].map(|y| start.y + y));
+        let within = xs.iter().fold(true, |all, &x| all & (x >= 0.0) & (x < most_x))
+            & ys.iter().fold(true, |all, &y| all & (y >= 0.0) & (y < most_y));
+        if !within {
+            return None;
+        }
+        // The four pixels around every place.
+        let mut around = [[0.0; LANES]; 4];
+        for k in 0..SIDE {
+            let i = ys[k] as usize * width + xs[k] as usize;
+            let (above, below) = (&data[i..i + 2], &data[i + width..i + width + 2]);
+            [around[0][k], around[1][k], around[2][k], around[3][k]] =
+                [above[0], above[1], below[0], below[1]];
+        }
+        for k in 0..LANES {
+            let (right, down) = (xs[k] - xs[k].floor(), ys[k] - ys[k].floor());
+            let above = around[0][k] + right * (around[1][k] - around[0][k]);
+            let below = around[2][k] + right * (around[3][k] - around[2][k]);
+            row[k] = above + down * (below - above);
         }
     }
     Some(out)

@@ -136,7 +136,7 @@ fn with_all(body: &str, scene: Scene, turns: [Vector2<f64>; 2], check: impl Fn(&
 fn seen(search: &Search, off: &Vector6<f64>) -> Vec<Patch> {
     let mut refined = Refined::new(&perturb(&pose(), off), false);
     search.lay_out(&mut refined, &FINAL.layout);
-    [search.print(&refined), search.ground(&refined)].concat()
+    [search.print(&refined), search.ground(&refined, ENOUGH)].concat()
 }
 
 fn mean(patches: &[Patch], of: impl Fn(&Patch) -> f64) -> f64 {
@@ -357,7 +357,7 @@ fn how_high_the_table_is_says_how_far_away_a_plain_object_is() {
             let height = |r: &Refined| r.pose.translation.vector.z - pose().translation.vector.z;
             let before = height(&refined);
             for _ in 0..3 {
-                refined.patches = search.ground(&refined);
+                refined.patches = search.ground(&refined, ENOUGH);
                 let mut moved = Move::default();
                 (0..STEPS).for_each(|_| search.advance(&mut refined, &[], 0.2, &mut moved));
                 refined.apply(&moved);
