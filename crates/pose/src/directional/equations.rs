@@ -179,7 +179,7 @@ impl Equations {
             let left = residual - patch.by_surface * seen.shared - seen.own_px[0];
             // Heavy tails: gloss, and what stands before the object in one view.
             let variance = tailed(patch.noise_px * patch.noise_px, left, SQUARE_TAIL);
-            sums.add(trust.worth / variance, residual, &by);
+            sums.add(patch.worth / variance, residual, &by);
         }
         let (rows, rhs) = absorb(&mut self.sums, sums);
         self.parts.push(Eliminated { part, rows, rhs });

@@ -180,14 +180,12 @@ impl Search<'_> {
         // Which of the tops of the edges is as far away as the surface is, print knows.
         let seen: Vec<Vec<Patch>> = optima.iter().map(|o| self.print(&o.0)).collect();
         // The ground is looked for once: from top to top it is but a little higher or lower.
-        let mut found = optima.iter().map(|(top, _)| (top, self.ground(top, print::ENOUGH)));
-        let ground = found.find(|(_, squares)| !squares.is_empty());
-        let from = |refined: &Refined| match &ground {
-            Some((top, squares)) => {
-                let moved = top.to(refined);
-                squares.iter().map(|p| p.after(&moved)).collect()
-            }
-            None => Vec::new(),
+        let top = &optima[0].0;
+        let ground = print::ON_GROUND.iter().map(|layout| self.ground(top, layout, print::ENOUGH));
+        let ground = ground.into_iter().find(|squares| !squares.is_empty()).unwrap_or_default();
+        let from = |refined: &Refined| {
+            let moved = top.to(refined);
+            ground.iter().map(|p| p.after(&moved)).collect()
         };
         let grounds: Vec<Vec<Patch>> = optima.iter().map(|o| from(&o.0)).collect();
         let told = print::supported(&grounds);

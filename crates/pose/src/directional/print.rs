@@ -33,21 +33,54 @@ use super::search::Search;
 use super::sites::{ByShared, Site};
 use super::verdict::Explained;
 use pair::{Pair, pixel_of};
-use square::{HALF, Needs, find, print_at};
+use square::{Needs, find, print_at};
 
 /// What the object rests on, as one of its surfaces.
 const GROUND: u16 = u16::MAX;
 
-/// How squares are laid on a surface, and how well it is known before it is seen.
-pub(super) struct Trust {
+/// How squares are laid on a surface.
+pub(super) struct Layout {
+    /// They are of 15 pixels' side, not of 7.
+    large: bool,
     /// Distance from square to square (px), times the working scale: large objects have enough of them.
     step: usize,
     /// Squares that there must be.
     least: usize,
+    /// How many measurements a square is worth, as squares overlap.
+    worth: f64,
     /// What a square needs to be found.
     needs: Needs,
-    /// How many measurements a square is worth, as squares overlap.
-    pub worth: f64,
+}
+
+/// On the object. Fewer squares are a highlight, or the shadow of a handle.
+const ON_OBJECT: Layout = Layout {
+    large: false,
+    step: 2,
+    least: 4,
+    worth: 0.15,
+    needs: Needs { contrast: 2.0, correlation: 0.8 },
+};
+/// On what the object rests on, one after the other until there are squares. It is large, so each may say
+/// little; of what noise hides from small squares large ones see more.
+pub(super) const ON_GROUND: [Layout; 2] = [
+    Layout {
+        large: false,
+        step: 4,
+        least: 16,
+        worth: 0.5,
+        needs: Needs { contrast: 1.5, correlation: 0.65 },
+    },
+    Layout {
+        large: true,
+        step: 6,
+        least: 24,
+        worth: 0.25,
+        needs: Needs { contrast: 1.0, correlation: 0.5 },
+    },
+];
+
+/// How well a surface is known before it is seen.
+pub(super) struct Trust {
     /// Deviation of the whole surface from where the record has it (m), and its degrees of freedom.
     pub surface_sd: f64,
     /// See `surface_sd`.
@@ -56,28 +89,11 @@ pub(super) struct Trust {
     pub between_sd_px: f64,
 }
 
-/// The object's surfaces: sides bulge, labels stand off. Fewer squares are a highlight, or the shadow of a
-/// handle.
-const OF_OBJECT: Trust = Trust {
-    step: 2,
-    least: 4,
-    needs: Needs { contrast: 2.0, correlation: 0.8 },
-    worth: 0.15,
-    surface_sd: 0.0004,
-    surface_tail: f64::INFINITY,
-    between_sd_px: 0.06,
-};
-/// What the object rests on: feet and bent bottoms lift it a little, a coaster or a hand by more. It is
-/// large, and its squares may each say little.
-const OF_GROUND: Trust = Trust {
-    step: 4,
-    least: 16,
-    needs: Needs { contrast: 1.5, correlation: 0.65 },
-    worth: 0.5,
-    surface_sd: 0.0004,
-    surface_tail: 1.0,
-    between_sd_px: 0.03,
-};
+/// The object's surfaces: sides bulge, labels stand off.
+const OF_OBJECT: Trust =
+    Trust { surface_sd: 0.0004, surface_tail: f64::INFINITY, between_sd_px: 0.06 };
+/// What the object rests on: feet and bent bottoms lift it a little, a coaster or a hand by more.
+const OF_GROUND: Trust = Trust { surface_sd: 0.0004, surface_tail: 1.0, between_sd_px: 0.03 };
 
 /// Deviation of the ground's slopes against the object (rad); the object's own surfaces have none.
 pub(super) const SLOPE_SD: f64 = 0.003;
@@ -113,6 +129,8 @@ pub struct Patch {
     pub residual: f64,
     /// Deviation of that by noise (px).
     pub noise_px: f64,
+    /// How many measurements it is worth: squares overlap.
+    pub worth: f64,
     /// Shift by the surface along its own normal (px per m).
     pub by_surface: f64,
     /// Shift by the shared unknowns (px per unit).
@@ -149,14 +167,16 @@ impl Patch {
 impl Search<'_> {
     /// The squares of print that both views show of a refined object.
     pub(super) fn print(&self, refined: &Refined) -> Vec<Patch> {
-        let Some(pair) = Pair::new(self, refined) else { return Vec::new() };
-        squares(&pair, extent(&refined.sites, &pair.sights[0].fine), false, usize::MAX)
+        let within = extent(&refined.sites);
+        let pair = Pair::new(self, refined);
+        pair.map_or_else(Vec::new, |pair| squares(&pair, within, &ON_OBJECT, false, usize::MAX))
     }
 
     /// The squares of what a refined object seems to rest on, all or so many as are enough.
-    pub(super) fn ground(&self, refined: &Refined, enough: usize) -> Vec<Patch> {
+    pub(super) fn ground(&self, refined: &Refined, layout: &Layout, enough: usize) -> Vec<Patch> {
+        let everywhere = [0.0..f64::INFINITY, 0.0..f64::INFINITY];
         let pair = Pair::new(self, refined).filter(Pair::rests);
-        pair.map_or_else(Vec::new, |pair| squares(&pair, whole(&pair.sights[0].fine), true, enough))
+        pair.map_or_else(Vec::new, |pair| squares(&pair, everywhere, layout, true, enough))
     }
 
     /// Of poses that differ, best first, those that do not rest where the ground is lose evidence: a box on
@@ -169,33 +189,44 @@ impl Search<'_> {
             return;
         }
         // All squares: that a pose has more of them than another is what tells.
-        let seen = different[..rivals].iter().map(|d| self.ground(&d.0, usize::MAX));
-        let seen: Vec<Vec<Patch>> = seen.collect();
+        let seen = ON_GROUND.iter().map(|layout| {
+            let poses = different[..rivals].iter();
+            poses.map(|d| self.ground(&d.0, layout, usize::MAX)).collect::<Vec<_>>()
+        });
+        let Some(seen) = seen.into_iter().find(|s| s.iter().any(|s| !s.is_empty())) else { return };
         let told = supported(&seen);
         different.iter_mut().zip(told).for_each(|(d, told)| d.1.evidence += told);
         different.sort_by(|a, b| b.1.evidence.total_cmp(&a.1.evidence));
     }
 }
 
-/// Squares in a part of the first view, of the ground or of everything else: of every other row and column
-/// first, then of those between, until there are enough, or so few that there will not be the least.
-fn squares(pair: &Pair, area: [Range<usize>; 2], ground: bool, enough: usize) -> Vec<Patch> {
-    let trust = if ground { &OF_GROUND } else { &OF_OBJECT };
-    let step = trust.step * pair.sights[0].coarse.scale;
+/// Squares in some columns and rows of the first picture, of the ground or of everything else: of every other
+/// column and row first, then of those between, until there are enough, or so few that there will not be the
+/// least.
+fn squares(
+    pair: &Pair,
+    within: [Range<f64>; 2],
+    layout: &Layout,
+    ground: bool,
+    enough: usize,
+) -> Vec<Patch> {
+    let step = layout.step * pair.sights[0].coarse.scale;
+    let (half, at) = if layout.large { (7, at::<16, 15> as At) } else { (3, at::<8, 7> as At) };
+    let area = room(&pair.sights[0].fine, within, half + 1);
     let mut out: Vec<Patch> = Vec::new();
     for (k, from) in [(0, 0), (step, step), (step, 0), (0, step)].into_iter().enumerate() {
-        if k > 0 && !(k * trust.least / 4..enough).contains(&out.len()) {
+        if k > 0 && !(k * layout.least / 4..enough).contains(&out.len()) {
             break;
         }
         let places = lattice(area.clone(), 2 * step, from);
-        out.extend(places.filter_map(|(x, y)| at(pair, x, y, ground)));
+        out.extend(places.filter_map(|(x, y)| at(pair, x, y, layout, ground)));
     }
     if ground {
         keep_level(&mut out);
     }
     out.sort_by_key(|p| p.part);
     let surfaces = out.chunk_by(|a, b| a.part == b.part);
-    surfaces.filter(|squares| squares.len() >= trust.least).flatten().cloned().collect()
+    surfaces.filter(|squares| squares.len() >= layout.least).flatten().cloned().collect()
 }
 
 /// Columns and rows of an area that are a step apart, row by row.
@@ -208,19 +239,28 @@ fn lattice(
     rows.skip(down).step_by(step).flat_map(row)
 }
 
+/// [`at`] for squares of one size.
+type At = fn(&Pair, usize, usize, &Layout, bool) -> Option<Patch>;
+
 /// The square about a pixel of the first level, on the ground or on the object.
-fn at(pair: &Pair, x: usize, y: usize, ground: bool) -> Option<Patch> {
-    let needs = if ground { &OF_GROUND.needs } else { &OF_OBJECT.needs };
+fn at<const LANES: usize, const SIDE: usize>(
+    pair: &Pair,
+    x: usize,
+    y: usize,
+    layout: &Layout,
+    ground: bool,
+) -> Option<Patch> {
     let [first, second] = pair.sights.map(|s| &s.fine);
-    let here = print_at(first, x, y, needs)?;
+    let here = print_at::<LANES, SIDE>(first, x, y, &layout.needs)?;
     let middle = pair.surface(pixel_of(first, x, y)).filter(|s| (s.part == GROUND) == ground)?;
-    let (place, by_surface) = pair.carry_over(x, y, middle)?;
-    let found = find(&here, first, second, &place, needs)?;
+    let (place, by_surface) = pair.carry_over(x, y, SIDE / 2, middle)?;
+    let found = find(&here, first, second, &place, &layout.needs)?;
     Some(Patch {
         pixel: pixel_of(first, x, y).into(),
         part: middle.part,
         residual: found.shift,
         noise_px: found.noise_px,
+        worth: layout.worth,
         by_surface,
         by_shared: pair.by_shared(&middle) * by_surface,
         by_slope: pair.by_slope(&middle) * by_surface,
@@ -246,7 +286,7 @@ fn keep_level(squares: &mut Vec<Patch>) {
 /// may be gloss.
 pub(super) fn evidence(patches: &[Patch]) -> f64 {
     let surfaces = patches.chunk_by(|a, b| a.part == b.part);
-    surfaces.map(|s| (OF_OBJECT.worth * s.len() as f64 - off(s)).max(0.0)).sum()
+    surfaces.map(|s| (s.iter().map(|p| p.worth).sum::<f64>() - off(s)).max(0.0)).sum()
 }
 
 /// What speaks against each of some poses (nats, at most zero) as the ground that it was found with does not
@@ -288,7 +328,7 @@ pub(super) fn contact(ground: &[Patch], covariance: &Matrix6<f64>) -> f64 {
 fn mean(squares: &[Patch]) -> (f64, f64, f64) {
     let (mut weight, mut shift, mut by_surface) = (0.0, 0.0, 0.0);
     for patch in squares {
-        let w = patch.trust().worth / (patch.noise_px * patch.noise_px);
+        let w = patch.worth / (patch.noise_px * patch.noise_px);
         weight += w;
         shift += w * patch.residual;
         by_surface += w * patch.by_surface;
@@ -307,26 +347,26 @@ fn off(squares: &[Patch]) -> f64 {
     0.5 * (tail + 1.0) * (shift * shift / (tail * variance)).ln_1p()
 }
 
-/// Columns and rows of the first view's level in which squares may have their middles: those of the
-/// contour, as far as whole squares and their slopes are within the level.
-fn extent(sites: &[Site], level: &Level) -> [Range<usize>; 2] {
+/// Columns and rows of the first picture (px) that the contour is in.
+fn extent(sites: &[Site]) -> [Range<f64>; 2] {
     let (mut low, mut high) = ((f64::INFINITY, f64::INFINITY), (0f64, 0f64));
     for site in sites.iter().filter(|s| s.view == 0) {
         low = (low.0.min(site.pixel.0), low.1.min(site.pixel.1));
         high = (high.0.max(site.pixel.0), high.1.max(site.pixel.1));
     }
-    let range = |low: f64, high: f64, origin: usize, size: usize| {
-        let least = (low - origin as f64).max((HALF + 1) as f64) as usize;
-        let most = (high - origin as f64).max(0.0) as usize;
-        least..most.min(size.saturating_sub(HALF + 1))
-    };
-    [
-        range(low.0, high.0, level.origin.0, level.width()),
-        range(low.1, high.1, level.origin.1, level.height()),
-    ]
+    [low.0..high.0, low.1..high.1]
 }
 
-/// All columns and rows that whole squares and their slopes have room for.
-fn whole(level: &Level) -> [Range<usize>; 2] {
-    [level.width(), level.height()].map(|size| HALF + 1..size.saturating_sub(HALF + 1))
+/// Columns and rows of a level that are within those of its picture (px) and have so many beside them on
+/// either side, which a whole square and its slopes need.
+fn room(level: &Level, within: [Range<f64>; 2], beside: usize) -> [Range<usize>; 2] {
+    let range = |within: &Range<f64>, origin: usize, size: usize| {
+        let least = (within.start - origin as f64).max(beside as f64) as usize;
+        let most = (within.end - origin as f64).max(0.0) as usize;
+        least..most.min(size.saturating_sub(beside))
+    };
+    [
+        range(&within[0], level.origin.0, level.width()),
+        range(&within[1], level.origin.1, level.height()),
+    ]
 }

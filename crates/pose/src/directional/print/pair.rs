@@ -8,7 +8,7 @@ use nalgebra::{Matrix2, Point3, RowVector2, Vector2, Vector3};
 use vergence_geometry::Transform;
 
 use super::GROUND;
-use super::square::{HALF, Place};
+use super::square::Place;
 use crate::directional::equations::VIEWS;
 use crate::directional::level::Level;
 use crate::directional::refine::Refined;
@@ -129,9 +129,9 @@ impl<'a> Pair<'a> {
         Some(Seen { p, part: GROUND, normal: -rest.down })
     }
 
-    /// Where the square about a pixel of the first level is in the second, and its shift along the epipolar
-    /// line by the surface along its own normal (px per m).
-    pub fn carry_over(&self, x: usize, y: usize, seen: Seen) -> Option<(Place, f64)> {
+    /// Where the square of half a side about a pixel of the first level is in the second, and its shift along
+    /// the epipolar line by the surface along its own normal (px per m).
+    pub fn carry_over(&self, x: usize, y: usize, half: usize, seen: Seen) -> Option<(Place, f64)> {
         let Seen { p, part, normal } = seen;
         let [first, second] = self.sights;
         let pixel = pixel_of(&first.fine, x, y);
@@ -140,7 +140,7 @@ impl<'a> Pair<'a> {
         if normal.dot(&to_second) < if on_ground { GRAZING } else { FACING } {
             return None;
         }
-        let half = HALF as f64;
+        let half = half as f64;
         let corner = half + MARGIN_PX;
         let beside_tag = |(tag, radius): &(Vector2<f64>, f64)| {
             (tag - pixel).map(|d| (d.abs() - half).max(0.0)).norm() < *radius

@@ -10,11 +10,6 @@ use nalgebra::{Matrix2, SMatrix, Vector2};
 use crate::directional::equations::VIEWS;
 use crate::directional::level::Level;
 
-/// Half the side of a square without its middle, its side and its pixels.
-pub const HALF: usize = 3;
-const SIDE: usize = 2 * HALF + 1;
-const PIXELS: usize = SIDE * SIDE;
-const LANES: usize = 8;
 /// Rounds of the shift's refinement, and how far it may go (px): repeated print is further apart.
 const ROUNDS: usize = 4;
 const REACH_PX: f64 = 2.0;
@@ -67,57 +62,70 @@ pub struct Found {
 }
 
 /// Grey levels of a square: a row of the picture in every column, padded with zeros to a whole vector.
-pub type Square = SMatrix<f32, LANES, SIDE>;
+pub type Square<const LANES: usize, const SIDE: usize> = SMatrix<f32, LANES, SIDE>;
 
 /// The square about a pixel that is far enough from the border, without its mean and its slopes; `None`
 /// where there is little to see.
-pub fn print_at(level: &Level, x: usize, y: usize, needs: &Needs) -> Option<Square> {
-    let flat = flattened(&square(level, x, y));
-    let least = needs.contrast * level.step_noise * (PIXELS as f32).sqrt();
+pub fn print_at<const LANES: usize, const SIDE: usize>(
+    level: &Level,
+    x: usize,
+    y: usize,
+    needs: &Needs,
+) -> Option<Square<LANES, SIDE>> {
+    let flat = flattened(&square::<LANES, SIDE>(level, x, y));
+    let least = needs.contrast * level.step_noise * SIDE as f32;
     (flat.norm() >= least).then_some(flat)
 }
 
 /// The grey levels around a pixel that is far enough from the border.
 #[inline(always)]
-fn square(level: &Level, x: usize, y: usize) -> Square {
-    let mut out = Square::zeros();
-    for (row, mut to) in (y - HALF..).zip(out.column_iter_mut()) {
-        let from = &level.smooth.row(row)[x - HALF..][..SIDE];
+fn square<const LANES: usize, const SIDE: usize>(
+    level: &Level,
+    x: usize,
+    y: usize,
+) -> Square<LANES, SIDE> {
+    let half = SIDE / 2;
+    let mut out = Square::<LANES, SIDE>::zeros();
+    for (row, mut to) in (y - half..).zip(out.column_iter_mut()) {
+        let from = &level.smooth.row(row)[x - half..][..SIDE];
         to.iter_mut().zip(from).for_each(|(to, from)| *to = *from);
     }
     out
 }
 
 /// Where a square's pixel is from its middle, by lane.
-const AT: [f32; LANES] = {
+const fn places<const LANES: usize, const SIDE: usize>() -> [f32; LANES] {
     let mut at = [0.0; LANES];
     let mut k = 0;
     while k < SIDE {
-        at[k] = k as f32 - HALF as f32;
+        at[k] = k as f32 - (SIDE / 2) as f32;
         k += 1;
     }
     at
-};
+}
 
 /// Without its mean and its slopes.
 #[inline(always)]
-fn flattened(square: &Square) -> Square {
+fn flattened<const LANES: usize, const SIDE: usize>(
+    square: &Square<LANES, SIDE>,
+) -> Square<LANES, SIDE> {
+    let at = const { places::<LANES, SIDE>() };
     // Sum of k^2 over all pixels.
-    const SQUARES: f32 = (SIDE * HALF * (HALF + 1) * SIDE / 3) as f32;
+    let squares = (SIDE * (SIDE / 2) * (SIDE / 2 + 1) * SIDE / 3) as f32;
     let (mut columns, mut by_y) = ([0.0; LANES], [0.0; LANES]);
-    for (row, y) in square.column_iter().zip(AT) {
+    for (row, y) in square.column_iter().zip(at) {
         for k in 0..LANES {
             columns[k] += row[k];
             by_y[k] += y * row[k];
         }
     }
-    let mean = columns.iter().sum::<f32>() / PIXELS as f32;
-    let by_x = columns.iter().zip(AT).map(|(v, x)| v * x).sum::<f32>() / SQUARES;
-    let by_y = by_y.iter().sum::<f32>() / SQUARES;
+    let mean = columns.iter().sum::<f32>() / (SIDE * SIDE) as f32;
+    let by_x = columns.iter().zip(at).map(|(v, x)| v * x).sum::<f32>() / squares;
+    let by_y = by_y.iter().sum::<f32>() / squares;
     let mut out = *square;
-    for (mut row, y) in out.column_iter_mut().zip(AT) {
+    for (mut row, y) in out.column_iter_mut().zip(at) {
         for k in 0..SIDE {
-            row[k] -= mean + by_x * AT[k] + by_y * y;
+            row[k] -= mean + by_x * at[k] + by_y * y;
         }
     }
     out
@@ -126,8 +134,8 @@ fn flattened(square: &Square) -> Square {
 /// Where the second picture shows a square: Gauss-Newton on shift and contrast, the slopes being the first
 /// picture's.
 #[multiversion(targets("x86_64+avx2+fma", "aarch64+neon"))]
-pub fn find(
-    here: &Square,
+pub fn find<const LANES: usize, const SIDE: usize>(
+    here: &Square<LANES, SIDE>,
     first: &Level,
     second: &Level,
     place: &Place,
@@ -135,7 +143,7 @@ pub fn find(
 ) -> Option<Found> {
     let hh = here.norm_squared();
     let look = |shift: f64| {
-        let there = flattened(&warped(second, place, shift)?);
+        let there = flattened(&warped::<LANES, SIDE>(second, place, shift)?);
         let correlation = here.dot(&there) / (hh * there.norm_squared()).sqrt();
         (correlation >= LEAST_CORRELATION).then_some((there, correlation))
     };
@@ -145,7 +153,8 @@ pub fn find(
     let back = place.affine.try_inverse()?;
     let (x, y) = place.middle;
     let between = |dx: usize, dy: usize| {
-        let [before, after] = [square(first, x - dx, y - dy), square(first, x + dx, y + dy)];
+        let at = square::<LANES, SIDE>;
+        let [before, after] = [at(first, x - dx, y - dy), at(first, x + dx, y + dy)];
         (after - before) * 0.5
     };
     let slopes = [between(1, 0), between(0, 1)];
@@ -175,7 +184,7 @@ pub fn find(
         if shift.abs() > REACH_PX {
             return None;
         }
-        let rest = (tt - gain * ht + moved * st).max(0.0) / (PIXELS - 5) as f32;
+        let rest = (tt - gain * ht + moved * st).max(0.0) / (SIDE * SIDE - 5) as f32;
         noise_px = f64::from((rest * hh / determinant).sqrt() / gain);
         if change.abs() < STILL_PX {
             break;
@@ -191,16 +200,21 @@ pub fn find(
 /// The second picture where the square's pixels are in it, shifted along the epipolar line; `None` when
 /// some are outside.
 #[inline(always)]
-fn warped(level: &Level, place: &Place, shift: f64) -> Option<Square> {
+fn warped<const LANES: usize, const SIDE: usize>(
+    level: &Level,
+    place: &Place,
+    shift: f64,
+) -> Option<Square<LANES, SIDE>> {
+    let at = const { places::<LANES, SIDE>() };
     let (width, height) = (level.width(), level.height());
     let data = level.smooth.data();
     let middle = (place.there + place.epipolar * shift).cast::<f32>();
     let (affine, bend) = (place.affine.cast::<f32>(), place.bend.map(|b| b.cast::<f32>()));
     let (most_x, most_y) = (width as f32 - 1.0, height as f32 - 1.0);
-    let along = |axis: usize| AT.map(|x| affine[(axis, 0)] * x + bend[0][axis] * (x * x));
+    let along = |axis: usize| at.map(|x| affine[(axis, 0)] * x + bend[0][axis] * (x * x));
     let along = [along(0), along(1)];
-    let mut out = Square::zeros();
-    for (mut row, y) in out.column_iter_mut().zip(AT) {
+    let mut out = Square::<LANES, SIDE>::zeros();
+    for (mut row, y) in out.column_iter_mut().zip(at) {
         let start = affine.column(1) * y + bend[1] * (y * y) + middle;
         let (xs, ys) = (along[0].map(|x| start.x + x), along[1].map(|y| start.y + y));
         let within = xs.iter().fold(true, |all, &x| all & (x >= 0.0) & (x < most_x))
