@@ -181,7 +181,8 @@ impl Search<'_> {
         let seen: Vec<Vec<Patch>> = optima.iter().map(|o| self.print(&o.0)).collect();
         // The ground is looked for once: from top to top it is but a little higher or lower.
         let top = &optima[0].0;
-        let ground = print::ON_GROUND.iter().map(|layout| self.ground(top, layout, print::ENOUGH));
+        let ground =
+            print::ON_GROUND.iter().map(|sampling| self.ground(top, sampling, print::ENOUGH));
         let ground = ground.into_iter().find(|squares| !squares.is_empty()).unwrap_or_default();
         let from = |refined: &Refined| {
             let moved = top.to(refined);

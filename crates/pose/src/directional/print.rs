@@ -39,7 +39,7 @@ use square::{Needs, find, print_at};
 const GROUND: u16 = u16::MAX;
 
 /// How squares are laid on a surface.
-pub(super) struct Layout {
+pub(super) struct Sampling {
     /// They are of 15 pixels' side, not of 7.
     large: bool,
     /// Distance from square to square (px), times the working scale: large objects have enough of them.
@@ -53,7 +53,7 @@ pub(super) struct Layout {
 }
 
 /// On the object. Fewer squares are a highlight, or the shadow of a handle.
-const ON_OBJECT: Layout = Layout {
+const ON_OBJECT: Sampling = Sampling {
     large: false,
     step: 2,
     least: 4,
@@ -62,15 +62,15 @@ const ON_OBJECT: Layout = Layout {
 };
 /// On what the object rests on, one after the other until there are squares. It is large, so each may say
 /// little; of what noise hides from small squares large ones see more.
-pub(super) const ON_GROUND: [Layout; 2] = [
-    Layout {
+pub(super) const ON_GROUND: [Sampling; 2] = [
+    Sampling {
         large: false,
         step: 4,
         least: 16,
         worth: 0.5,
         needs: Needs { contrast: 1.5, correlation: 0.65 },
     },
-    Layout {
+    Sampling {
         large: true,
         step: 6,
         least: 24,
@@ -173,10 +173,15 @@ impl Search<'_> {
     }
 
     /// The squares of what a refined object seems to rest on, all or so many as are enough.
-    pub(super) fn ground(&self, refined: &Refined, layout: &Layout, enough: usize) -> Vec<Patch> {
+    pub(super) fn ground(
+        &self,
+        refined: &Refined,
+        sampling: &Sampling,
+        enough: usize,
+    ) -> Vec<Patch> {
         let everywhere = [0.0..f64::INFINITY, 0.0..f64::INFINITY];
         let pair = Pair::new(self, refined).filter(Pair::rests);
-        pair.map_or_else(Vec::new, |pair| squares(&pair, everywhere, layout, true, enough))
+        pair.map_or_else(Vec::new, |pair| squares(&pair, everywhere, sampling, true, enough))
     }
 
     /// Of poses that differ, best first, those that do not rest where the ground is lose evidence: a box on
@@ -189,9 +194,9 @@ impl Search<'_> {
             return;
         }
         // All squares: that a pose has more of them than another is what tells.
-        let seen = ON_GROUND.iter().map(|layout| {
+        let seen = ON_GROUND.iter().map(|sampling| {
             let poses = different[..rivals].iter();
-            poses.map(|d| self.ground(&d.0, layout, usize::MAX)).collect::<Vec<_>>()
+            poses.map(|d| self.ground(&d.0, sampling, usize::MAX)).collect::<Vec<_>>()
         });
         let Some(seen) = seen.into_iter().find(|s| s.iter().any(|s| !s.is_empty())) else { return };
         let told = supported(&seen);
@@ -206,27 +211,27 @@ impl Search<'_> {
 fn squares(
     pair: &Pair,
     within: [Range<f64>; 2],
-    layout: &Layout,
+    sampling: &Sampling,
     ground: bool,
     enough: usize,
 ) -> Vec<Patch> {
-    let step = layout.step * pair.sights[0].coarse.scale;
-    let (half, at) = if layout.large { (7, at::<16, 15> as At) } else { (3, at::<8, 7> as At) };
+    let step = sampling.step * pair.sights[0].coarse.scale;
+    let (half, at) = if sampling.large { (7, at::<16, 15> as At) } else { (3, at::<8, 7> as At) };
     let area = room(&pair.sights[0].fine, within, half + 1);
     let mut out: Vec<Patch> = Vec::new();
     for (k, from) in [(0, 0), (step, step), (step, 0), (0, step)].into_iter().enumerate() {
-        if k > 0 && !(k * layout.least / 4..enough).contains(&out.len()) {
+        if k > 0 && !(k * sampling.least / 4..enough).contains(&out.len()) {
             break;
         }
         let places = lattice(area.clone(), 2 * step, from);
-        out.extend(places.filter_map(|(x, y)| at(pair, x, y, layout, ground)));
+        out.extend(places.filter_map(|(x, y)| at(pair, x, y, sampling, ground)));
     }
     if ground {
         keep_level(&mut out);
     }
     out.sort_by_key(|p| p.part);
     let surfaces = out.chunk_by(|a, b| a.part == b.part);
-    surfaces.filter(|squares| squares.len() >= layout.least).flatten().cloned().collect()
+    surfaces.filter(|squares| squares.len() >= sampling.least).flatten().cloned().collect()
 }
 
 /// Columns and rows of an area that are a step apart, row by row.
@@ -240,27 +245,27 @@ fn lattice(
 }
 
 /// [`at`] for squares of one size.
-type At = fn(&Pair, usize, usize, &Layout, bool) -> Option<Patch>;
+type At = fn(&Pair, usize, usize, &Sampling, bool) -> Option<Patch>;
 
 /// The square about a pixel of the first level, on the ground or on the object.
 fn at<const LANES: usize, const SIDE: usize>(
     pair: &Pair,
     x: usize,
     y: usize,
-    layout: &Layout,
+    sampling: &Sampling,
     ground: bool,
 ) -> Option<Patch> {
     let [first, second] = pair.sights.map(|s| &s.fine);
-    let here = print_at::<LANES, SIDE>(first, x, y, &layout.needs)?;
+    let here = print_at::<LANES, SIDE>(first, x, y, &sampling.needs)?;
     let middle = pair.surface(pixel_of(first, x, y)).filter(|s| (s.part == GROUND) == ground)?;
     let (place, by_surface) = pair.carry_over(x, y, SIDE / 2, middle)?;
-    let found = find(&here, first, second, &place, &layout.needs)?;
+    let found = find(&here, first, second, &place, &sampling.needs)?;
     Some(Patch {
         pixel: pixel_of(first, x, y).into(),
         part: middle.part,
         residual: found.shift,
         noise_px: found.noise_px,
-        worth: layout.worth,
+        worth: sampling.worth,
         by_surface,
         by_shared: pair.by_shared(&middle) * by_surface,
         by_slope: pair.by_slope(&middle) * by_surface,

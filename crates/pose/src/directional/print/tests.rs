@@ -365,12 +365,12 @@ fn a_table_below_a_plain_object_is_where_the_true_pose_puts_it() {
 fn large_squares_see_grain_that_noise_hides_from_small_ones() {
     let faint = Scene { grain: 5.0, noise: 3.0, ..PLAIN };
     let bare = Scene { grain: 0.0, ..faint };
-    let ground = |body, scene, layout: usize, up: f64| {
+    let ground = |body, scene, sampling: usize, up: f64| {
         let mut squares = Vec::new();
         let raised = perturb(&pose(), &Vector6::new(0.0, 0.0, 0.0, 0.0, 0.0, up));
         with_all(body, scene, Default::default(), |search| {
             let refined = Refined::new(&raised, false);
-            squares = search.ground(&refined, &ON_GROUND[layout], ENOUGH);
+            squares = search.ground(&refined, &ON_GROUND[sampling], ENOUGH);
         });
         squares
     };
