@@ -272,8 +272,9 @@ impl Probe {
         Ok(format!("told to drop 30 %: 60 frames read, {missing} missing, {counts:?}"))
     }
 
-    /// Orders a fault and reads until it was counted, and three frames more; the numbers of the first
-    /// and the last frame and how many are missing between them, all of which must be counted.
+    /// Orders a fault and reads until it was counted and frames are missing, which a reader that lags
+    /// behind sees later; the numbers of the first and the last frame and how many are missing between
+    /// them, all of which must be counted.
     fn after_fault(
         &self,
         camera: &mut V4l2Camera,
@@ -283,21 +284,20 @@ impl Probe {
         let first = camera.next_frame(SOON)?.sequence;
         self.set(fault)?;
         let begin = Instant::now();
-        let (mut read, mut more) = (1, 3);
-        let last = loop {
+        let mut read = 1;
+        let (last, missing) = loop {
             let last = camera.next_frame(SOON)?.sequence;
             read += 1;
-            if happened(&camera.counts()) {
-                more -= 1;
+            let missing = last + 1 - first - read;
+            if happened(&camera.counts()) && missing > 0 {
+                break (last, missing);
             }
-            if more == 0 {
-                break last;
-            }
-            ensure(begin.elapsed() < SOON, || format!("{:?}", camera.counts()))?;
+            ensure(begin.elapsed() < SOON, || {
+                format!("{missing} missing from {first} to {last}, counted {:?}", camera.counts())
+            })?;
         };
         let counts = camera.counts();
-        let missing = last + 1 - first - read;
-        ensure(missing > 0 && missing <= counts.lost + counts.damaged + counts.skipped, || {
+        ensure(missing <= counts.lost + counts.damaged + counts.skipped, || {
             format!("{missing} missing from {first} to {last}, counted {counts:?}")
         })?;
         Ok((first, last, missing))
