@@ -273,8 +273,8 @@ impl Probe {
     }
 
     /// Orders a fault and reads until it was counted and frames are missing, which a reader that lags
-    /// behind sees later; the numbers of the first and the last frame and how many are missing between
-    /// them, all of which must be counted.
+    /// behind sees later, and three frames more; the numbers of the first and the last frame and how many
+    /// are missing between them, all of which must be counted.
     fn after_fault(
         &self,
         camera: &mut V4l2Camera,
@@ -284,12 +284,15 @@ impl Probe {
         let first = camera.next_frame(SOON)?.sequence;
         self.set(fault)?;
         let begin = Instant::now();
-        let mut read = 1;
+        let (mut read, mut more) = (1, 3);
         let (last, missing) = loop {
             let last = camera.next_frame(SOON)?.sequence;
             read += 1;
             let missing = last + 1 - first - read;
             if happened(&camera.counts()) && missing > 0 {
+                more -= 1;
+            }
+            if more == 0 {
                 break (last, missing);
             }
             ensure(begin.elapsed() < SOON, || {

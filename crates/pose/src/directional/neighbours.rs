@@ -181,9 +181,7 @@ impl Search<'_> {
         let seen: Vec<Vec<Patch>> = optima.iter().map(|o| self.print(&o.0)).collect();
         // The ground is looked for once: from top to top it is but a little higher or lower.
         let top = &optima[0].0;
-        let ground =
-            print::ON_GROUND.iter().map(|sampling| self.ground(top, sampling, print::ENOUGH));
-        let ground = ground.into_iter().find(|squares| !squares.is_empty()).unwrap_or_default();
+        let ground = self.grounds(&[top], print::ENOUGH).remove(0);
         let from = |refined: &Refined| {
             let moved = top.to(refined);
             ground.iter().map(|p| p.after(&moved)).collect()

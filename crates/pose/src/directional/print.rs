@@ -39,7 +39,7 @@ use square::{Needs, find, print_at};
 const GROUND: u16 = u16::MAX;
 
 /// How squares are laid on a surface.
-pub(super) struct Sampling {
+struct Sampling {
     /// They are of 15 pixels' side, not of 7.
     large: bool,
     /// Distance from square to square (px), times the working scale: large objects have enough of them.
@@ -62,7 +62,7 @@ const ON_OBJECT: Sampling = Sampling {
 };
 /// On what the object rests on, one after the other until there are squares. It is large, so each may say
 /// little; of what noise hides from small squares large ones see more.
-pub(super) const ON_GROUND: [Sampling; 2] = [
+const ON_GROUND: [Sampling; 2] = [
     Sampling {
         large: false,
         step: 4,
@@ -172,13 +172,15 @@ impl Search<'_> {
         pair.map_or_else(Vec::new, |pair| squares(&pair, within, &ON_OBJECT, false, usize::MAX))
     }
 
-    /// The squares of what a refined object seems to rest on, all or so many as are enough.
-    pub(super) fn ground(
-        &self,
-        refined: &Refined,
-        sampling: &Sampling,
-        enough: usize,
-    ) -> Vec<Patch> {
+    /// The squares of what each of some refined poses seems to rest on, all of them or so many as are
+    /// enough: of the first sampling by which any pose has some, so that they can be compared.
+    pub(super) fn grounds(&self, poses: &[&Refined], enough: usize) -> Vec<Vec<Patch>> {
+        let by = |s| poses.iter().map(|p| self.ground(p, s, enough)).collect::<Vec<_>>();
+        let found = ON_GROUND.iter().map(by).find(|seen| seen.iter().any(|g| !g.is_empty()));
+        found.unwrap_or_else(|| vec![Vec::new(); poses.len()])
+    }
+
+    fn ground(&self, refined: &Refined, sampling: &Sampling, enough: usize) -> Vec<Patch> {
         let everywhere = [0.0..f64::INFINITY, 0.0..f64::INFINITY];
         let pair = Pair::new(self, refined).filter(Pair::rests);
         pair.map_or_else(Vec::new, |pair| squares(&pair, everywhere, sampling, true, enough))
@@ -194,12 +196,8 @@ impl Search<'_> {
             return;
         }
         // All squares: that a pose has more of them than another is what tells.
-        let seen = ON_GROUND.iter().map(|sampling| {
-            let poses = different[..rivals].iter();
-            poses.map(|d| self.ground(&d.0, sampling, usize::MAX)).collect::<Vec<_>>()
-        });
-        let Some(seen) = seen.into_iter().find(|s| s.iter().any(|s| !s.is_empty())) else { return };
-        let told = supported(&seen);
+        let poses: Vec<&Refined> = different[..rivals].iter().map(|d| &d.0).collect();
+        let told = supported(&self.grounds(&poses, usize::MAX));
         different.iter_mut().zip(told).for_each(|(d, told)| d.1.evidence += told);
         different.sort_by(|a, b| b.1.evidence.total_cmp(&a.1.evidence));
     }

@@ -144,11 +144,12 @@ pub fn find<const LANES: usize, const SIDE: usize>(
     let hh = here.norm_squared();
     let look = |shift: f64| {
         let there = flattened(&warped::<LANES, SIDE>(second, place, shift)?);
-        let correlation = here.dot(&there) / (hh * there.norm_squared()).sqrt();
-        (correlation >= LEAST_CORRELATION).then_some((there, correlation))
+        let (ht, tt) = (here.dot(&there), there.norm_squared());
+        let correlation = ht / (hh * tt).sqrt();
+        (correlation >= LEAST_CORRELATION).then_some((there, ht, tt, correlation))
     };
     // Most that fail do so here: the second view sees something else there.
-    let (mut there, mut correlation) = look(0.0)?;
+    let (mut there, mut ht, mut tt, mut correlation) = look(0.0)?;
     // A step in the second picture is this step in the first.
     let back = place.affine.try_inverse()?;
     let (x, y) = place.middle;
@@ -170,9 +171,9 @@ pub fn find<const LANES: usize, const SIDE: usize>(
     let (mut shift, mut noise_px) = (0.0, f64::INFINITY);
     for round in 0..ROUNDS {
         if round > 0 {
-            (there, correlation) = look(shift)?;
+            (there, ht, tt, correlation) = look(shift)?;
         }
-        let (ht, st, tt) = (here.dot(&there), slopes.dot(&there), there.norm_squared());
+        let st = slopes.dot(&there);
         // there = gain here - moved slopes.
         let gain = (ht * ss - st * hs) / determinant;
         let moved = (ht * hs - st * hh) / determinant;

@@ -3,6 +3,7 @@
 use std::f64::consts::FRAC_PI_2;
 
 use nalgebra::{Matrix2, Matrix3, Point3, UnitQuaternion, Vector2, Vector3, Vector6};
+use rand::{RngExt, SeedableRng};
 use vergence_geometry::gaussian::perturb;
 use vergence_geometry::{Camera, GaussianPoint, Transform};
 use vergence_imaging::Image;
@@ -75,7 +76,9 @@ fn picture(
     model: &Model,
     (camera, base_from_optical): &(Camera, Transform),
     scene: Scene,
+    seed: u64,
 ) -> Image<u8> {
+    let mut noise = rand_pcg::Pcg32::seed_from_u64(seed);
     let object_from_optical = pose().inverse() * base_from_optical;
     let eye = object_from_optical.translation.vector;
     let lamp = Vector3::new(-0.6, 0.5, 0.6).normalize();
@@ -97,20 +100,9 @@ fn picture(
         let part = |k: usize| (k as f64 + 0.5) / RAYS as f64 - 0.5;
         let rays = (0..RAYS * RAYS).map(|k| (part(k % RAYS), part(k / RAYS)));
         let sum: f64 = rays.map(|(dx, dy)| level(x as f64 + dx, y as f64 + dy)).sum();
-        let noise = scene.noise * noise([x, y, (base_from_optical.translation.y * 1e3) as usize]);
-        (sum / (RAYS * RAYS) as f64 + noise).round() as u8
+        let gauss: f64 = (0..4).map(|_| noise.random_range(-1.0..1.0)).sum::<f64>() * 0.866;
+        (sum / (RAYS * RAYS) as f64 + scene.noise * gauss).round() as u8
     })
-}
-
-/// Of deviation one, without correlation: the sum of twelve numbers scattered over a unit.
-fn noise(of: [usize; 3]) -> f64 {
-    let mut state =
-        of.iter().fold(0u64, |s, &k| (s ^ k as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15));
-    let next = |_| {
-        state = (state ^ state >> 29).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        (state >> 40) as f64 / (1u64 << 24) as f64
-    };
-    (0..12).map(next).sum::<f64>() - 6.0
 }
 
 /// The landmark is measured this much too far away (m).
@@ -128,7 +120,7 @@ fn with_all(body: &str, scene: Scene, turns: [Vector2<f64>; 2], mut check: impl 
     let cameras = cameras();
     let images = [0, 1].map(|v| {
         let turned = Transform::rotation(turns[v].push(0.0));
-        picture(&model, &(cameras[v].0, cameras[v].1 * turned.inverse()), scene)
+        picture(&model, &(cameras[v].0, cameras[v].1 * turned.inverse()), scene, v as u64)
     });
     let views = [0, 1].map(|v| View {
         image: &images[v],
