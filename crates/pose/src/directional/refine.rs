@@ -11,9 +11,9 @@
 //! the servos' accuracy. The foot of a standing object, where the shadow begins, is measured only
 //! coarsely.
 
-use nalgebra::{Matrix3, Matrix6, SMatrix, SVector, Vector2, Vector3};
-use vergence_geometry::Transform;
+use nalgebra::{Matrix3, Matrix6, SMatrix, SVector, Unit, Vector2, Vector3};
 use vergence_geometry::gaussian::{difference, perturb, skew};
+use vergence_geometry::{Symmetry, Transform};
 
 use super::equations::{Edge, Equations, Move, Offsets, Solution, VIEWS, by_part, part_of};
 use super::print::Patch;
@@ -65,6 +65,13 @@ pub fn deviation(site: &Site, sd_px: f64) -> f64 {
 /// What holds against an attitude in which nothing can rest, where gravity is known (nats): objects
 /// in a room stand or lie unless a hand holds them.
 const UNSUPPORTED: f64 = 20.0;
+
+/// How many objects stand upright, their z axis up, to one that is upside down, where nobody says which.
+/// Fewer than the confidence that an answer needs, so that it never decides alone.
+const UPRIGHT: f64 = 8.0;
+/// Cosine between an object's z axis and the vertical from which on it counts as upright: where gravity
+/// is not known, a camera may look up or down as it likes, but is not held upside down.
+const UPRIGHT_FROM: f64 = 0.3;
 
 /// How many independent measurements a site is worth.
 pub fn independent(site: &Site) -> f64 {
@@ -262,7 +269,8 @@ impl Search<'_> {
         (a, b)
     }
 
-    /// What the priors hold against a state: half their squared normalised residuals.
+    /// What the priors hold against a state (nats): half their squared normalised residuals, and what attitudes
+    /// are rare.
     pub(super) fn strain(&self, state: &Refined) -> f64 {
         let landmark = (self.measured.whiten * self.landmark_residual(state).0).norm_squared();
         let form = (state.form - usual()).component_div(&form_sd()).norm_squared();
@@ -274,7 +282,18 @@ impl Search<'_> {
         let turns: f64 = (0..self.sights.len())
             .map(|v| self.turn_precision(v) * state.turns[v].norm_squared())
             .sum();
-        0.5 * (landmark + form + tilt + turns)
+        0.5 * (landmark + form + tilt + turns) - self.upright(state)
+    }
+
+    /// What speaks for a state because objects are rather upright than upside down (nats).
+    fn upright(&self, state: &Refined) -> f64 {
+        if self.query.standing.is_some() || self.symmetry == Symmetry::Full {
+            return 0.0;
+        }
+        let pictures_up = || -(self.sights[0].view.base_from_optical.rotation * Vector3::y());
+        let up = self.query.up.map_or_else(pictures_up, Unit::into_inner);
+        let cosine = (state.pose.rotation * Vector3::z()).dot(&up);
+        0.5 * UPRIGHT.ln() * (cosine / UPRIGHT_FROM).clamp(-1.0, 1.0)
     }
 
     /// The small turn (base frame) that would make the object rest exactly, when it seems to, and a

@@ -109,6 +109,42 @@ fn a_prism_with_a_notch_is_found() {
 }
 
 #[test]
+fn a_can_is_rather_upright_than_upside_down_where_its_landmark_hardly_tells() {
+    let shape = json!({"kind": "cylinder", "diameter": 0.066, "height": 0.12});
+    let can = |height: f64| {
+        record([0.066, 0.066, 0.12], shape.clone(), [0.033, 0.0, height], [1.0, 0.0, 0.0])
+    };
+    let piece = [Piece::Cylinder { radius: 0.033, half: 0.06 }];
+    let upright = UnitQuaternion::from_euler_angles(0.0, 0.0, PI);
+    let over = UnitQuaternion::from_euler_angles(PI, 0.0, PI);
+    let is_upright = |pose: &Transform| (pose.rotation * Vector3::z()).z > 0.9;
+    // The cameras are upright, too.
+    for gravity in [true, false] {
+        // Its light is 2.5 mm above the middle, seen at this height above it.
+        let seen_at = |height: f64| {
+            let record = can(0.0025);
+            let mut scene = Scene::new(&record, &piece, upright, 71);
+            let middle = scene.truth.translation.vector;
+            let off = scene.truth.rotation * Vector3::new(0.033, 0.0, height);
+            scene.landmark.position = Point3::from(middle + off);
+            (recognise(&scene, &record, gravity), scene.truth)
+        };
+        // About the middle it does not tell, and then nothing does.
+        let (tied, _) = seen_at(-0.0004);
+        let Err(Refusal::Ambiguous { best }) = tied else { panic!("{tied:?}") };
+        assert!(is_upright(&best.pose.pose) && best.confidence > 0.75, "{}", best.confidence);
+        assert!(best.alternatives.iter().any(|other| !is_upright(&other.pose)));
+        // For itself this would be five to one.
+        let (found, truth) = seen_at(0.001);
+        assert_right(&found, &truth);
+        // What it does tell is believed.
+        let record = can(0.02);
+        let scene = Scene::new(&record, &piece, over, 72);
+        assert_right(&recognise(&scene, &record, gravity), &scene.truth);
+    }
+}
+
+#[test]
 fn a_can_on_its_side_rests() {
     let shape = json!({"kind": "cylinder", "diameter": 0.066, "height": 0.12});
     let record = record([0.066, 0.066, 0.12], shape, [0.033, 0.0, 0.02], [1.0, 0.0, 0.0]);
