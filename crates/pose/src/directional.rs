@@ -7,6 +7,7 @@
 //! views see on the object and on what it rests on ([`neighbours`], [`print`]), and how much the best
 //! explains that a different pose would not ([`verdict`]).
 
+mod ascent;
 pub mod edges;
 mod equations;
 pub mod field;
@@ -40,6 +41,9 @@ use verdict::Explained;
 /// others may be: the rough contour of a tilted or hidden object may explain little.
 const SURE_FINALISTS: usize = 3;
 const BEHIND: f64 = 15.0;
+
+/// What a refined pose may be behind (nats) and still turn out to be the best once it has ascended.
+const OVERTAKES: f64 = 10.0;
 
 /// Smoothing before the search's edges (px of the working scale): enough to average noise.
 const SEARCH_BLUR_PX: f32 = 0.7;
@@ -161,6 +165,11 @@ pub fn recognise_traced<'a>(
     let rough = search.ranked(rough, |a, b| search.are_alike(a, b, config.distinct, f64::INFINITY));
     let fine = search.finalists(rough).into_iter().map(|r| search.refine_finely(r)).collect();
     let mut fine = search.ranked(fine, |a, b| search.is_same(a, b));
+    let worth_it = fine.first().map_or(0.0, |best| best.1.evidence) - OVERTAKES;
+    for found in fine.iter_mut().filter(|found| found.1.evidence > worth_it) {
+        search.ascend(found);
+    }
+    let mut fine = search.ranked(fine, |a, b| search.is_same(a, b));
     if let Some(twins) = fine.first().map(|best| search.twins(&best.0)) {
         fine.extend(twins);
     }
@@ -194,6 +203,7 @@ pub fn track(
     let search = Search::new(&sights, &model, query, (landmark, normal), config);
     let (rough, _) = search.refine_roughly(last, false);
     let mut best = search.refine_finely(rough);
+    search.ascend(&mut best);
     search.settle(&mut best);
     let found = search.verdict(&[best])?;
     let turned = search.symmetry.angle_between(&found.pose.pose.rotation, &last.rotation);

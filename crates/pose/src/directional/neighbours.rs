@@ -33,7 +33,7 @@ const WORTH_A_START: f64 = 0.3;
 const MOVES: f64 = 0.4;
 const NEAR: f64 = 0.5;
 /// What comes this near (px) to a known optimum will end there.
-const CAUGHT_PX: f64 = 0.4;
+pub(super) const CAUGHT_PX: f64 = 0.4;
 /// Deviations (px) with which a start glides, one after the other.
 const GLIDES: [f64; 2] = [1.0, 0.6];
 /// Passes that refine what did not glide back.
@@ -63,18 +63,31 @@ const MOST_BEHIND: f64 = 4.6;
 impl Search<'_> {
     /// Moves to the mean of the optima nearby and widens the covariance by them.
     pub(super) fn settle(&self, best: &mut (Refined, Explained)) {
-        let metric = contour_metric(&best.0);
+        let starts =
+            |_: &Refined, around: &[Site], metric: &Matrix6<f64>| self.starts(around, metric);
+        *best = self.mixture(self.tops(best, starts, HOPELESS * DOUBT_NATS));
+    }
+
+    /// The distinct tops around a pose, highest first: where the starts around the highest lead that are
+    /// behind by no more than this (nats), the edges around looked at alike.
+    pub(super) fn tops(
+        &self,
+        of: &(Refined, Explained),
+        starts: impl Fn(&Refined, &[Site], &Matrix6<f64>) -> Vec<Vector6<f64>>,
+        behind: f64,
+    ) -> Vec<(Refined, Explained)> {
+        let metric = contour_metric(&of.0);
         let apart = |a: &Refined, b: &Refined| {
             let d = difference(&a.pose, &b.pose);
             (d.transpose() * metric * d).x.sqrt()
         };
-        let mut optima = vec![best.clone()];
+        let mut optima = vec![of.clone()];
         for _ in 0..MOST_TOPS {
             let top = optima[0].clone();
             let (around, explains) = self.weigh(top.0.without_sites(), &self.wide());
             let parts = by_part(&around.sites);
-            let least = explains.evidence - HOPELESS * DOUBT_NATS;
-            for start in self.starts(&around.sites, &metric) {
+            let least = explains.evidence - behind;
+            for start in starts(&top.0, &around.sites, &metric) {
                 let known = |r: &Refined| optima.iter().any(|o| apart(&o.0, r) < CAUGHT_PX);
                 optima.extend(self.other_top(&top.0, &start, &parts, least, known));
             }
@@ -83,7 +96,7 @@ impl Search<'_> {
                 break;
             }
         }
-        *best = self.mixture(optima);
+        optima
     }
 
     /// Where a start ends that is off the top by a tangent, on the sites around the top; `None` where

@@ -11,7 +11,7 @@
 //! the servos' accuracy. The foot of a standing object, where the shadow begins, is measured only
 //! coarsely.
 
-use nalgebra::{Matrix3, Matrix6, SMatrix, SVector, Unit, Vector2, Vector3};
+use nalgebra::{Matrix3, Matrix6, SMatrix, SVector, Unit, Vector2, Vector3, Vector6};
 use vergence_geometry::gaussian::{difference, perturb, skew};
 use vergence_geometry::{Symmetry, Transform};
 
@@ -248,6 +248,17 @@ impl Search<'_> {
         let turns = self.measured.by_turn.iter().zip(&state.turns);
         let moved: Vector3<f64> = turns.map(|(by_turn, turn)| by_turn * turn).sum();
         (self.query.landmark.position.coords - moved - centre - lever, j)
+    }
+
+    /// Information and right-hand side of the pose's tangent, edges aside.
+    pub(super) fn known(&self, state: &Refined) -> (Matrix6<f64>, Vector6<f64>) {
+        let (a, b) = self.prior(state);
+        let (residual, by_shared) = self.landmark_residual(state);
+        let whitened = self.measured.whiten * by_shared.fixed_columns::<6>(0);
+        (
+            a.fixed_view::<6, 6>(0, 0) + whitened.transpose() * whitened,
+            b.fixed_rows::<6>(0) + whitened.transpose() * (self.measured.whiten * residual),
+        )
     }
 
     /// Information and right-hand side of gravity and of the form.
