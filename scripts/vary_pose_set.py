@@ -1,10 +1,12 @@
 """Variants of a pose set, so that a change is not judged by the very pictures it was made with.
 
-Usage: python vary_pose_set.py SET OUT [--mirror] [--half] [--seed N]     (needs numpy, pillow)
+Usage: python vary_pose_set.py SET OUT [--mirror] [--half] [--elsewhere] [--seed N]     (needs numpy, pillow)
 
 Writes the scenes of SET (layout: docs/pose.md) to OUT with another error of the landmark, drawn
 from its covariance; with --mirror as seen in a mirror (every form in a record is its own mirror
-image, but for prisms and convex bodies, which are left out), with --half at half the size.
+image, but for prisms and convex bodies, which are left out), with --half at half the size, with
+--elsewhere with the landmark where the object is not: to the side by 0.8 to 1.3 times its diagonal, so
+that every answer is wrong.
 """
 import argparse, json, os, shutil
 
@@ -45,6 +47,20 @@ def halve(camera):
     camera["cam_K"] = k.ravel().tolist()
 
 
+def beside(landmark, box, camera, picture, rng):
+    k, turn = matrix(camera["cam_K"]), matrix(camera["cam_R_w2c"])
+    size = np.array(Image.open(picture).size)
+    diagonal = 1000 * np.linalg.norm([box[side] for side in ("width", "length", "height")])
+    for _ in range(100):
+        angle = rng.uniform(0, 2 * np.pi)
+        aside = diagonal * rng.uniform(0.8, 1.3) * np.array([np.cos(angle), np.sin(angle), 0])
+        place = landmark + turn.T @ aside
+        pixel = k @ (turn @ place + camera["cam_t_w2c"])
+        if np.all((pixel[:2] > 0) & (pixel[:2] < pixel[2] * size)):
+            return place
+    raise SystemExit(f"{picture}: shows nothing beside the object")
+
+
 def vary(source, target, args, rng):
     tags = read(f"{source}/scene_tags.json")
     key = next(iter(tags))
@@ -60,6 +76,8 @@ def vary(source, target, args, rng):
     place = matrix(truth["cam_R_m2c"]) @ place + np.array(truth["cam_t_m2c"]) - np.array(camera["cam_t_w2c"])
     covariance = matrix(entry["landmark_cov_w"])
     landmark = matrix(camera["cam_R_w2c"]).T @ place + rng.multivariate_normal(np.zeros(3), covariance)
+    if args.elsewhere:
+        landmark = beside(landmark, entry["tag"]["bounding_box"], camera, f"{source}/gray_left/{int(key):06d}.png", rng)
     # A robot's base is mirrored left to right; without one the world is the camera.
     world = np.diag([1.0, -1.0, 1.0]) if "pan" in camera else CAMERA
     if args.mirror:
@@ -89,6 +107,7 @@ parser.add_argument("set")
 parser.add_argument("out")
 parser.add_argument("--mirror", action="store_true")
 parser.add_argument("--half", action="store_true")
+parser.add_argument("--elsewhere", action="store_true")
 parser.add_argument("--seed", type=int, default=0)
 args = parser.parse_args()
 rng = np.random.default_rng(args.seed)
