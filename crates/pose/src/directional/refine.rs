@@ -11,7 +11,7 @@
 //! the servos' accuracy. The foot of a standing object, where the shadow begins, is measured only
 //! coarsely.
 
-use nalgebra::{Matrix3, Matrix6, SMatrix, SVector, Unit, Vector2, Vector3, Vector6};
+use nalgebra::{Matrix3, Matrix6, SMatrix, SVector, Vector2, Vector3, Vector6};
 use vergence_geometry::gaussian::{difference, perturb, skew};
 use vergence_geometry::{Symmetry, Transform};
 
@@ -69,8 +69,7 @@ const UNSUPPORTED: f64 = 20.0;
 /// How many objects stand upright, their z axis up, to one that is upside down, where nobody says which.
 /// Fewer than the confidence that an answer needs, so that it never decides alone.
 const UPRIGHT: f64 = 8.0;
-/// Cosine between an object's z axis and the vertical from which on it counts as upright: where gravity
-/// is not known, a camera may look up or down as it likes, but is not held upside down.
+/// Cosine between an object's z axis and the vertical from which on it counts as upright, not as on its side.
 const UPRIGHT_FROM: f64 = 0.3;
 
 /// How many independent measurements a site is worth.
@@ -301,10 +300,17 @@ impl Search<'_> {
         if self.query.standing.is_some() || self.symmetry == Symmetry::Full {
             return 0.0;
         }
-        let pictures_up = || -(self.sights[0].view.base_from_optical.rotation * Vector3::y());
-        let up = self.query.up.map_or_else(pictures_up, Unit::into_inner);
-        let cosine = (state.pose.rotation * Vector3::z()).dot(&up);
-        0.5 * UPRIGHT.ln() * (cosine / UPRIGHT_FROM).clamp(-1.0, 1.0)
+        let axis = state.pose.rotation * Vector3::z();
+        let way = match self.query.up {
+            Some(up) if axis.dot(&up).abs() < UPRIGHT_FROM => 0.0,
+            Some(up) => axis.dot(&up).signum(),
+            // Cameras are not upside down either, but which way is level nobody knows.
+            None => {
+                let pictures_up = -(self.sights[0].view.base_from_optical.rotation * Vector3::y());
+                (axis.dot(&pictures_up) / UPRIGHT_FROM).clamp(-1.0, 1.0)
+            }
+        };
+        0.5 * UPRIGHT.ln() * way
     }
 
     /// The small turn (base frame) that would make the object rest exactly, when it seems to, and a
