@@ -165,8 +165,8 @@ pub fn recognise_traced<'a>(
     let rough = search.ranked(rough, |a, b| search.are_alike(a, b, config.distinct, f64::INFINITY));
     let fine = search.finalists(rough).into_iter().map(|r| search.refine_finely(r)).collect();
     let mut fine = search.ranked(fine, |a, b| search.is_same(a, b));
-    let worth_it = fine.first().map_or(0.0, |best| best.1.evidence) - OVERTAKES;
-    for found in fine.iter_mut().filter(|found| found.1.evidence > worth_it) {
+    let least = fine.first().map_or(0.0, |best| best.1.evidence) - OVERTAKES;
+    for found in fine.iter_mut().filter(|found| found.1.evidence > least) {
         search.ascend(found);
     }
     let mut fine = search.ranked(fine, |a, b| search.is_same(a, b));

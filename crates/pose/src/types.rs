@@ -40,10 +40,11 @@ pub struct Query<'a> {
     pub landmark: GaussianPoint,
     /// Which of the record's landmarks it is.
     pub landmark_index: usize,
-    /// Direction against gravity in the base frame, when known: standing poses are tried first.
+    /// Direction against gravity in the base frame, when known: standing poses are tried first. When it is
+    /// not, the first view's picture is taken to be upright, roughly.
     pub up: Option<Unit<Vector3<f64>>>,
     /// Whether the object is known to stand upright (its z axis along `up`) or known not to;
-    /// `None` when nobody knows.
+    /// `None` when nobody knows: then upright is likelier than upside down.
     pub standing: Option<bool>,
 }
 
