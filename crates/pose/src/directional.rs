@@ -54,6 +54,10 @@ const PLACE_BLUR_PX: f32 = 0.35;
 /// Passes at full resolution, down to how well edges fit.
 const FINE: [Pass; 2] = [Pass::new(0.6, 4.0, 2.5, true), FINAL];
 
+/// Passes from a pose that is off by some pixels; the last, as [`FINE`], from one that hardly is.
+const NEAR: [Pass; 4] =
+    [Pass::new(2.0, 8.0, 4.0, true), Pass::new(1.0, 4.0, 2.5, true), FINE[0], FINE[1]];
+
 /// Alternatives reported.
 const MOST_ALTERNATIVES: usize = 4;
 
@@ -203,7 +207,18 @@ pub fn track(
     let search = Search::new(&sights, &model, query, (landmark, normal), config);
     let (rough, _) = search.refine_roughly(last, false);
     let mut best = search.refine_finely(rough);
-    search.ascend(&mut best);
+    if search.scale() > 1.0 {
+        // From one picture to the next there is little to make up for, and what is right to a pixel of a
+        // reduced picture can lead away from it.
+        for passes in [&NEAR[..], &NEAR[NEAR.len() - FINE.len()..]] {
+            let mut near = Refined::new(last, false);
+            search.refine(&mut near, passes);
+            let near = search.both(near);
+            if near.1.evidence > best.1.evidence {
+                best = near;
+            }
+        }
+    }
     search.settle(&mut best);
     let found = search.verdict(&[best])?;
     let turned = search.symmetry.angle_between(&found.pose.pose.rotation, &last.rotation);
