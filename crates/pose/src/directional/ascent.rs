@@ -9,11 +9,11 @@
 
 use nalgebra::{Matrix6, RowVector6, Vector6};
 
-use super::neighbours::CAUGHT_PX;
-use super::refine::{Refined, STRAY_DENSITY, absence, independent};
+use super::neighbours::{CAUGHT_PX, moves_px};
+use super::refine::{Refined, STRAY_DENSITY, absence, deviation, independent};
 use super::search::Search;
 use super::sites::Site;
-use super::verdict::Explained;
+use super::verdict::{Explained, add_gaussian};
 
 /// Picks of edges, and how many edges make a pose: as many as it has turns.
 const SAMPLES: usize = 800;
@@ -46,24 +46,15 @@ struct Voice<'a> {
 
 impl<'a> Voice<'a> {
     fn new(site: &'a Site) -> Self {
-        let sharpness =
-            0.5 / (AGREE_SD_PX.powi(2) + (site.offset_sd() * site.px_per_metre).powi(2));
+        let sd = deviation(site, AGREE_SD_PX);
         let missing = absence(site);
         let here = (1.0 - missing) / site.places().count() as f64;
-        let peak = here * (sharpness / std::f64::consts::PI).sqrt();
+        let peak = here / (sd * std::f64::consts::TAU.sqrt());
         let mut density = [missing * STRAY_DENSITY; ASKED];
         for (place, _) in site.places() {
             for edge in site.edges() {
-                // A Gaussian on an even grid: its logarithm has constant second differences.
-                let off = edge.offset - place + (ASKED / 2) as f64 * SPACING_PX;
-                let mut value = peak * edge.weight * (-sharpness * off * off).exp();
-                let mut ratio = (sharpness * SPACING_PX * (2.0 * off - SPACING_PX)).exp();
-                let change = (-2.0 * sharpness * SPACING_PX * SPACING_PX).exp();
-                for density in &mut density {
-                    *density += value;
-                    value *= ratio;
-                    ratio *= change;
-                }
+                let first = edge.offset - place + (ASKED / 2) as f64 * SPACING_PX;
+                add_gaussian(&mut density, peak * edge.weight, first / sd, SPACING_PX / sd);
             }
         }
         Voice {
@@ -122,8 +113,7 @@ impl Search<'_> {
         samples.sort_by(|a, b| b.0.total_cmp(&a.0));
         let mut starts: Vec<Vector6<f64>> = Vec::new();
         for (_, tangent) in samples {
-            let apart = |d: Vector6<f64>| d.dot(&(metric * d)).sqrt() > CAUGHT_PX;
-            if starts.iter().all(|start| apart(start - tangent)) {
+            if starts.iter().all(|start| moves_px(metric, &(start - tangent)) > CAUGHT_PX) {
                 starts.push(tangent);
             }
             if starts.len() == STARTS {

@@ -77,10 +77,7 @@ impl Search<'_> {
         behind: f64,
     ) -> Vec<(Refined, Explained)> {
         let metric = contour_metric(&of.0);
-        let apart = |a: &Refined, b: &Refined| {
-            let d = difference(&a.pose, &b.pose);
-            (d.transpose() * metric * d).x.sqrt()
-        };
+        let apart = |a: &Refined, b: &Refined| moves_px(&metric, &difference(&a.pose, &b.pose));
         let mut optima = vec![of.clone()];
         for _ in 0..MOST_TOPS {
             let top = optima[0].clone();
@@ -185,6 +182,11 @@ fn contour_metric(refined: &Refined) -> Matrix6<f64> {
         metric += j.transpose() * j;
     }
     metric / refined.sites.len().max(1) as f64
+}
+
+/// How far a tangent moves the contour across itself (root mean square, px), by its metric.
+pub(super) fn moves_px(metric: &Matrix6<f64>, by: &Vector6<f64>) -> f64 {
+    (by.transpose() * metric * by).x.sqrt()
 }
 
 impl Search<'_> {

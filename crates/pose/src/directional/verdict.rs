@@ -164,18 +164,24 @@ fn likelihoods(site: &Site, place: f64, sd_px: f64, scale: f64) -> Likelihoods {
         if r.abs() > FAR * sd + REACH as f64 * STEP * common {
             continue;
         }
-        // A Gaussian on an even grid: its logarithm has constant second differences.
         let peak = scale * c.weight / (sd * (2.0 * std::f64::consts::PI).sqrt());
-        let mut value = peak * (-0.5 * first * first).exp();
-        let mut ratio = (step * first - 0.5 * step * step).exp();
-        let change = (-step * step).exp();
-        for sum in &mut sums[usize::from(c.slope > 0.0)] {
-            *sum += value;
-            value *= ratio;
-            ratio *= change;
-        }
+        add_gaussian(&mut sums[usize::from(c.slope > 0.0)], peak, first, step);
     }
     sums
+}
+
+/// Adds a Gaussian's values on an even grid that begins `first` deviations from its middle and goes on in
+/// steps of so many: its logarithm has constant second differences.
+#[inline]
+pub(super) fn add_gaussian<const N: usize>(sums: &mut [f64; N], peak: f64, first: f64, step: f64) {
+    let mut value = peak * (-0.5 * first * first).exp();
+    let mut ratio = (step * first - 0.5 * step * step).exp();
+    let change = (-step * step).exp();
+    for sum in sums {
+        *sum += value;
+        value *= ratio;
+        ratio *= change;
+    }
 }
 
 #[cfg(test)]
