@@ -54,7 +54,7 @@ const PLACE_BLUR_PX: f32 = 0.35;
 /// Passes at full resolution, down to how well edges fit.
 const FINE: [Pass; 2] = [Pass::new(0.6, 4.0, 2.5, true), FINAL];
 
-/// Passes from a pose that is off by some pixels; the last, as [`FINE`], from one that hardly is.
+/// Passes from a pose that is off by some pixels: what is wider than [`FINE`], and that.
 const NEAR: [Pass; 4] =
     [Pass::new(2.0, 8.0, 4.0, true), Pass::new(1.0, 4.0, 2.5, true), FINE[0], FINE[1]];
 
@@ -210,7 +210,7 @@ pub fn track(
     if search.scale() > 1.0 {
         // From one picture to the next there is little to make up for, and what is right to a pixel of a
         // reduced picture can lead away from it.
-        for passes in [&NEAR[..], &NEAR[NEAR.len() - FINE.len()..]] {
+        for passes in [&NEAR[..], &FINE] {
             let mut near = Refined::new(last, false);
             search.refine(&mut near, passes);
             let near = search.both(near);
